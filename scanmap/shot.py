@@ -1,0 +1,99 @@
+"""`Shot`: the seam between the world and the mathematics.
+
+A live rig, the digital twin and every kind of recording yield the same `Shot`s; everything below knows
+nothing of devices or clocks. Images stay encoded, as the camera sent them, until a decode worker opens them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.errors import CameraError
+
+Image = NDArray[np.uint8]
+
+JPEG_MAGIC = b"\xff\xd8\xff"
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One picture of the laser line at one bearing."""
+
+    index: int  # running number within the scan
+    bearing: float  # [rad] counter-clockwise about z, as the stage reported it
+    bearing_commanded: float  # [rad] as the plan asked for
+    time: float  # [s] since the scan began; for recordings of others, since their epoch
+    image: bytes  # encoded (JPEG or PNG), laser on
+    background: bytes | None = None  # encoded, laser off, same bearing
+
+
+class Decoded(NamedTuple):
+    """A decoded image, and how much of it can be believed."""
+
+    image: Image  # (H, W) grey or (H, W, 3) BGR
+    rows_valid: int  # rows from the top that were decoded from data; H if the file is whole
+
+
+def image_format(data: bytes) -> str:
+    """`"jpeg"` or `"png"` by the first bytes, else `"unknown"`."""
+    if data.startswith(JPEG_MAGIC):
+        return "jpeg"
+    return "png" if data.startswith(PNG_MAGIC) else "unknown"
+
+
+def decode_image(data: bytes, *, grey: bool = False) -> Decoded:
+    """Decode JPEG or PNG bytes.
+
+    Args:
+        data: encoded image.
+        grey: decode to one plane (the JPEG's luminance) instead of BGR.
+
+    Raises:
+        CameraError: nothing could be decoded.
+
+    A JPEG that was cut short is decoded down to the cut; `rows_valid` says how far.
+    """
+    if image_format(data) == "jpeg":
+        return _decode_jpeg(data, grey)
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise CameraError(f"image cannot be decoded: {len(data)} bytes, neither a whole JPEG nor PNG")
+    return Decoded(np.asarray(pixels, np.uint8), pixels.shape[0])
+
+
+def encode_png(image: Image) -> bytes:
+    """Lossless bytes of an (H, W) or (H, W, 3) BGR image, for sources that have no encoded form."""
+    ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise CameraError(f"image of shape {image.shape} cannot be encoded as PNG")
+    return bytes(data)
+
+
+def _decode_jpeg(data: bytes, grey: bool) -> Decoded:
+    import simplejpeg
+
+    colourspace = "GRAY" if grey else "BGR"
+    try:
+        pixels = simplejpeg.decode_jpeg(data, colorspace=colourspace)
+        rows = pixels.shape[0]
+    except ValueError:
+        try:
+            pixels = simplejpeg.decode_jpeg(data, colorspace=colourspace, strict=False)
+        except ValueError as error:
+            raise CameraError(f"JPEG of {len(data)} bytes cannot be decoded: {error}") from error
+        rows = _rows_before_fill(pixels)
+    return Decoded(np.asarray(pixels[:, :, 0] if grey else pixels), rows)
+
+
+def _rows_before_fill(pixels: Image) -> int:
+    """Rows above the uniform area a decoder fills in where a JPEG was cut, less one block for the cut row."""
+    flat = pixels.reshape(pixels.shape[0], -1)
+    differs = (flat != flat[-1]).any(axis=1)
+    last = int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
+    return max(0, last - 16) if last < len(flat) else len(flat)

@@ -1,0 +1,239 @@
+"""The three range models: `LaserLine` to `Profile`, columns to points in the head frame.
+
+`plane` is the calibrated ray met with the laser plane. `ratio` and `pixel_angle` are Algorithms 1 and 2 of
+the thesis, kept exact with their limits; the height of a point follows from the pinhole ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, model_validator
+
+from scanmap.calibration import Calibration, PixelAngleModel, RatioModel
+from scanmap.errors import CalibrationError
+from scanmap.geometry import intersect_rays_plane
+from scanmap.laserline import LaserLine, Reason
+
+Array = NDArray[np.float64]
+
+# Algorithm 2 is valid below this angle only; the thesis's limit.
+THETA_MAX_DEG = 60.0
+
+
+class TriangulationParams(BaseModel, frozen=True, extra="forbid"):
+    """Which range model turns columns into points, and between which ranges; `[triangulation]`."""
+
+    model: Literal["plane", "ratio", "pixel_angle"] = Field(
+        "plane", description="plane: calibrated ray meets laser plane; ratio, pixel_angle: Algorithms 1, 2"
+    )
+    range_min_m: float = Field(0.04, ge=0, description="nearer points are taken for no return [m]")
+    range_max_m: float = Field(8.0, gt=0, description="farther points are taken for no return [m]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TriangulationParams:
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError(f"range_min_m {self.range_min_m} must be below range_max_m {self.range_max_m}")
+        return self
+
+
+class Profile(NamedTuple):
+    """What one shot measured. Arrays of length H, the image's rows; NaN where a row has no point."""
+
+    points: Array  # (H, 3) head frame [m]
+    range_m: Array  # (H,) distance from the head's origin
+    sigma_m: Array  # (H,) |dP/du| sigma_px, standard deviation along the ray
+    intensity: Array  # (H,) line height above the background [grey levels]
+    column_px: Array  # (H,) the laser line's column the point came from
+    reason: NDArray[np.uint8]  # (H,) Reason
+
+
+def ratio_depth(column: Array, model: RatioModel) -> Array:
+    """Depth d [m] of Algorithm 1 at `column` [px]; negative or infinite left of infinity.
+
+    Source: p = (l - ppx) / l, d = x / ((tan a + tan b) - 2 p tan a), equations 7 to 12 of the thesis.
+    """
+    tan_a, tan_b = np.tan(np.radians([model.alpha_deg, model.beta_deg]))
+    p = pixel_ratio(column, model.width)
+    with np.errstate(divide="ignore"):
+        depth: Array = model.baseline_m / ((tan_a + tan_b) - 2.0 * p * tan_a)
+    return depth
+
+
+def pixel_ratio(column: Array, width: int) -> Array:
+    """The thesis's p = (l - ppx) / l."""
+    return (width - column) / width
+
+
+def pixel_angle_depth(column: Array, model: PixelAngleModel) -> Array:
+    """Depth d [m] of Algorithm 2 at `column` [px], the bare formula without its 60 deg limit.
+
+    Source: theta = rpc ppx + ro in degrees, d = x / tan(theta).
+    """
+    theta = np.radians(model.rpc_deg * column + model.ro_deg)
+    with np.errstate(divide="ignore"):
+        depth: Array = model.baseline_m / np.tan(theta)
+    return depth
+
+
+def ratio_model_of(calibration: Calibration) -> RatioModel:
+    """`[ratio]` of the calibration, or the same head in Algorithm 1's terms where it has none."""
+    if calibration.ratio is not None:
+        return calibration.ratio
+    alpha, beta = np.degrees([calibration.alpha, calibration.beta])
+    return RatioModel(float(alpha), float(beta), _baseline(calibration), calibration.intrinsics.width)
+
+
+def pixel_angle_model_of(calibration: Calibration) -> PixelAngleModel:
+    """`[pixel_angle]` of the calibration, or the straight line through its pinhole angles where it has none."""
+    if calibration.pixel_angle is not None:
+        return calibration.pixel_angle
+    own = calibration.intrinsics
+    column = np.arange(own.width, dtype=np.float64)
+    theta = np.degrees(calibration.beta + np.arctan((column - own.cx) / own.fx))
+    usable = (theta > 0) & (theta < THETA_MAX_DEG)
+    if usable.sum() < 2:
+        raise CalibrationError("pixel_angle model: no column of this head lies between 0 and 60 deg; use model plane")
+    rpc, ro = np.polyfit(column[usable], theta[usable], 1)
+    return PixelAngleModel(float(rpc), float(ro), _baseline(calibration))
+
+
+def triangulate(line: LaserLine, calibration: Calibration, params: TriangulationParams) -> Profile:
+    """Points of one laser line in the head frame.
+
+    Args:
+        line: columns per image row, (H,).
+        calibration: the head; its image height must be H.
+        params: range model and limits.
+
+    Returns:
+        Profile of length H; rows without a column, below or beyond range are NaN with their reason.
+
+    Raises:
+        CalibrationError: H is not the calibration's image height.
+    """
+    rows = len(line.column_px)
+    if rows != calibration.intrinsics.height:
+        raise CalibrationError(f"laser line has {rows} rows, the calibration {calibration.intrinsics.height}")
+    points, slope, below = locate(line.column_px, np.arange(rows, dtype=np.float64), calibration, params)
+    range_m = np.linalg.norm(points, axis=-1)
+    found = line.reason == Reason.OK
+    reason = line.reason.copy()
+    reason[found & ~(range_m <= params.range_max_m)] = Reason.BEYOND_RANGE
+    reason[found & (below | (range_m < params.range_min_m))] = Reason.BELOW_RANGE
+    lost = reason != Reason.OK
+    for values in (points, range_m, slope):
+        values[lost] = np.nan
+    return Profile(
+        points=points,
+        range_m=range_m,
+        sigma_m=slope * line.sigma_px,
+        intensity=np.where(lost, np.nan, line.peak),
+        column_px=np.where(lost, np.nan, line.column_px),
+        reason=reason,
+    )
+
+
+def locate(
+    column: Array, row: Array, calibration: Calibration, params: TriangulationParams
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Points of pixels under the chosen range model.
+
+    Args:
+        column, row: (N,) pixel coordinates, NaN allowed.
+
+    Returns:
+        points (N, 3) in the head frame [m], NaN at and beyond infinity; |dP/du| (N,) [m/px]; and whether
+        the model says "below range" (N,).
+    """
+    if params.model == "plane":
+        return _locate_on_plane(column, row, calibration)
+    if params.model == "ratio":
+        model = ratio_model_of(calibration)
+        return _locate_by_depth(column, row, calibration, lambda u: ratio_depth(u, model), None)
+    angle = pixel_angle_model_of(calibration)
+    # The limit stands a rounding error below 60, so that a column exactly at it is below range.
+    limit = (THETA_MAX_DEG - angle.ro_deg) / angle.rpc_deg - 1e-9
+    return _locate_by_depth(column, row, calibration, lambda u: pixel_angle_depth(u, angle), limit)
+
+
+def column_window(calibration: Calibration, params: TriangulationParams) -> Array:
+    """First and last column (H, 2) a return between range_min and range_max can have, per image row.
+
+    NaN in rows that can have none. Nothing outside is ever the laser line: geometry is a filter.
+    """
+    own = calibration.intrinsics
+    step = 8.0
+    column = np.append(np.arange(0.0, own.width - 1, step), own.width - 1.0)
+    row = np.arange(own.height, dtype=np.float64)
+    u, v = (a.ravel() for a in np.meshgrid(column, row))
+    points, _, below = locate(u, v, calibration, params)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(below, np.inf, 1.0 / np.linalg.norm(points, axis=-1)).reshape(own.height, -1)
+        largest = 1.0 / params.range_min_m if params.range_min_m > 0 else np.inf
+    inside = (inverse >= 1.0 / params.range_max_m) & (inverse <= largest)
+    return _refine_window(inverse, inside, column, 1.0 / params.range_max_m, largest)
+
+
+def _refine_window(inverse: Array, inside: NDArray[np.bool_], column: Array, low: float, high: float) -> Array:
+    """Columns where the inverse range enters and leaves [low, high]: it is all but linear in the column."""
+    rows, last = np.arange(len(inverse)), len(column) - 1
+    window = np.full((len(inverse), 2), np.nan)
+    some = inside.any(axis=1)
+    edges = (inside.argmax(axis=1), last - inside[:, ::-1].argmax(axis=1))
+    for side, (edge, outward) in enumerate(zip(edges, (-1, 1), strict=True)):
+        beyond = np.clip(edge + outward, 0, last)
+        a, b = inverse[rows, edge], inverse[rows, beyond]
+        limit = np.where(np.nan_to_num(b, nan=0.0) < a, low, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.clip((limit - a) / (np.where(np.isfinite(b), b, np.nan) - a), 0.0, 1.0)
+        # Where the neighbour has no range (infinity, below range) take its column: wide, never narrow.
+        part = np.where(np.isfinite(part), part, 1.0)
+        window[some, side] = (column[edge] + part * (column[beyond] - column[edge]))[some]
+    return window
+
+
+def _baseline(calibration: Calibration) -> float:
+    baseline = calibration.baseline_m
+    if baseline < 1e-6:
+        raise CalibrationError("this head has no baseline: its camera lies in the laser plane")
+    return baseline
+
+
+def _locate_on_plane(column: Array, row: Array, calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_]]:
+    R, origin = calibration.T_head_camera[:3, :3], calibration.T_head_camera[:3, 3]
+    plane = calibration.laser_plane
+    rays = calibration.intrinsics.rays(column, row) @ R.T
+    t = intersect_rays_plane(origin, rays, plane)
+    t[~(t > 0)] = np.nan  # beyond infinity the ray meets the plane behind the camera
+    points = origin + t[:, None] * rays
+    # d/du of o + t r with n.(o + t r) + d = 0; the ray's own derivative is smooth, so a difference serves.
+    h = 0.5
+    d_rays = (calibration.intrinsics.rays(column + h, row) - calibration.intrinsics.rays(column - h, row)) @ R.T
+    d_rays /= 2.0 * h
+    slip = (d_rays @ plane[:3]) / (rays @ plane[:3])
+    slope = np.abs(t) * np.linalg.norm(d_rays - slip[:, None] * rays, axis=-1)
+    return points, slope, np.zeros(len(column), dtype=bool)
+
+
+def _locate_by_depth(
+    column: Array, row: Array, calibration: Calibration, depth_of: Callable[[Array], Array], last_column: float | None
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    own = calibration.intrinsics
+    baseline, beta = _baseline(calibration), calibration.beta
+
+    def point(u: Array) -> Array:
+        depth = depth_of(u)
+        depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan)
+        height = -(row - own.cy) / own.fy * (depth * np.cos(beta) + baseline * np.sin(beta))
+        return np.stack([depth, np.zeros_like(depth), height], axis=-1)
+
+    points = point(column)
+    h = 1e-3
+    slope = np.linalg.norm(point(column + h) - point(column - h), axis=-1) / (2.0 * h)
+    below = np.zeros(len(column), dtype=bool) if last_column is None else column >= last_column
+    points[below] = np.nan
+    return points, slope, below
