@@ -100,7 +100,7 @@ class Calibration:
     intrinsics: Intrinsics
     T_head_camera: Array  # (4, 4)
     laser_plane: Array  # (4,) n.x + d = 0 in the head frame, |n| = 1, metres
-    mount: HeadMount = HeadMount()
+    mount: HeadMount = field(default_factory=HeadMount)
     ratio: RatioModel | None = None
     pixel_angle: PixelAngleModel | None = None
     residuals: dict[str, Any] = field(default_factory=dict)

@@ -144,30 +144,28 @@ class Scan:
         merged = scan.taken(first)
         for k, (start, stop) in enumerate(zip(first, np.append(first[1:], len(scan)), strict=True)):
             if stop - start > 1:
-                scan._average(merged, k, slice(start, stop))
+                merged._set_average(k, scan, slice(start, stop))
         return merged
 
-    def _average(self, target: Scan, k: int, group: slice) -> None:
-        """Write the average of the columns `group` into column k of `target`."""
-        valid = self.valid[group]
-        sigma = np.where(valid, self.sigma_m[group], np.inf).astype(np.float64)
+    def _set_average(self, k: int, source: Scan, group: slice) -> None:
+        """Write the average of the columns `group` of `source` into column k."""
+        valid = source.valid[group]
+        sigma = np.where(valid, source.sigma_m[group], np.inf).astype(np.float64)
         best = sigma.argmin(axis=0)
         rows = np.arange(self.rows)
-        points = self.points[group].astype(np.float64)
+        points = source.points[group].astype(np.float64)
         apart = np.linalg.norm(points - points[best, rows], axis=-1)
         agree = valid & (apart <= np.maximum(4.0 * np.hypot(sigma, sigma[best, rows]), 2e-3))
         weight = np.where(agree, 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
         total = weight.sum(axis=0)
         some = total > 0
-        for name in ("points", "range_m", "intensity", "column_px"):
-            values = self._fields[name][: self._count][group].astype(np.float64)
-            w = weight[..., None] if values.ndim == 3 else weight
-            mean = np.where(w > 0, values, 0.0) * w
-            mean = mean.sum(axis=0)[some] / (total[some, None] if values.ndim == 3 else total[some])
-            target._fields[name][k, some] = mean
-        target._fields["sigma_m"][k, some] = 1.0 / np.sqrt(total[some])
-        target._fields["reason"][k] = self.reason[group][best, rows]
-        target._bearings[k] = self.bearings[group].mean()
+        averaged = {"points": points, "range_m": source.range_m[group], "intensity": source.intensity[group]}
+        for name, values in (averaged | {"column_px": source.column_px[group]}).items():
+            w, t = (weight[..., None], total[:, None]) if values.ndim == 3 else (weight, total)
+            self._fields[name][k, some] = (np.where(w > 0, values, 0.0) * w).sum(axis=0)[some] / t[some]
+        self._fields["sigma_m"][k, some] = 1.0 / np.sqrt(total[some])
+        self._fields["reason"][k] = source.reason[group][best, rows]
+        self._bearings[k] = source.bearings[group].mean()
 
     def _view(self, name: str) -> F32:
         values: F32 = self._fields[name][: self._count]
