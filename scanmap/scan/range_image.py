@@ -111,6 +111,29 @@ class Scan:
         T = [self.mount.T_world_head(float(b)) for b in self.bearings]
         return np.array([t[:3, 3] for t in T]).reshape(-1, 3)
 
+    @classmethod
+    def from_arrays(
+        cls,
+        mount: HeadMount,
+        bearings: F64,
+        fields: Mapping[str, NDArray[Any]],
+        comments: Mapping[str, Any] | None = None,
+    ) -> Scan:
+        """A scan of whole arrays.
+
+        Args:
+            mount: how the head sits on the axis.
+            bearings: (B,) [rad].
+            fields: `points` (B, H, 3) world frame [m]; `range_m`, `sigma_m`, `intensity`, `column_px` and `reason`
+                (B, H), as the properties of the same names describe them.
+            comments: what files say about this scan.
+        """
+        scan = cls(mount, fields["reason"].shape[1], comments)
+        scan._count = len(bearings)
+        scan._bearings = np.asarray(bearings, np.float64)
+        scan._fields = {name: np.asarray(fields[name], own.dtype) for name, own in scan._fields.items()}
+        return scan
+
     def without(self, mask: NDArray[np.bool_], reason: Reason) -> Scan:
         """A copy in which the cells of `mask` (B, H) have no point any more, for `reason`."""
         copy = self.taken(np.arange(self._count))
@@ -122,50 +145,43 @@ class Scan:
 
     def taken(self, order: NDArray[np.intp]) -> Scan:
         """A copy with the bearings of index `order` (N,), in that order."""
-        copy = Scan(self.mount, self.rows, self.comments)
-        copy._count = len(order)
-        copy._bearings = self._bearings[order]
-        copy._fields = {name: values[order] for name, values in self._fields.items()}
-        return copy
+        fields = {name: values[order] for name, values in self._fields.items()}
+        return Scan.from_arrays(self.mount, self._bearings[order], fields, self.comments)
 
     def merged(self, tolerance_deg: float = 0.02) -> Scan:
         """Sorted by bearing, with bearings closer than the tolerance made one column.
 
-        Passes forward and backward, and repeated bearings, measure the same cell: where they agree within
-        their errors (4 sigma, at least 2 mm) the points are averaged with weights 1 / sigma^2, where they do
+        Passes forward and backward, repeated bearings and a second turn measure the same cell: where they agree
+        within their errors (4 sigma, at least 2 mm) the points are averaged with weights 1 / sigma^2, where they do
         not the one with the smaller sigma stays.
         """
-        scan = self.taken(np.argsort(self.bearings, kind="stable"))
-        if len(scan) < 2:
-            return scan
-        first = np.flatnonzero(np.diff(scan.bearings, prepend=-np.inf) > np.radians(tolerance_deg))
-        if len(first) == len(scan):
-            return scan
-        merged = scan.taken(first)
-        for k, (start, stop) in enumerate(zip(first, np.append(first[1:], len(scan)), strict=True)):
-            if stop - start > 1:
-                merged._set_average(k, scan, slice(start, stop))
-        return merged
+        bearings, groups = bearing_columns(self.bearings, float(np.radians(tolerance_deg)))
+        fields = self.taken(np.array([group[0] for group in groups], np.intp))._fields
+        means = np.array([bearings[group].mean() for group in groups])
+        for k, group in enumerate(groups):
+            if len(group) > 1:
+                for name, values in self._average(group).items():
+                    fields[name][k] = values
+        return Scan.from_arrays(self.mount, means, fields, self.comments)
 
-    def _set_average(self, k: int, source: Scan, group: slice) -> None:
-        """Write the average of the columns `group` of `source` into column k."""
-        valid = source.valid[group]
-        sigma = np.where(valid, source.sigma_m[group], np.inf).astype(np.float64)
-        best = sigma.argmin(axis=0)
-        rows = np.arange(self.rows)
-        points = source.points[group].astype(np.float64)
+    def _average(self, group: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+        """The fields of one column (H, ...) that the columns `group` of this scan measured together."""
+        reason = self.reason[group]
+        sigma = np.where(reason == Reason.OK, self.sigma_m[group], np.inf).astype(np.float64)
+        best, rows = sigma.argmin(axis=0), np.arange(self.rows)
+        points = self.points[group].astype(np.float64)
         apart = np.linalg.norm(points - points[best, rows], axis=-1)
-        agree = valid & (apart <= np.maximum(4.0 * np.hypot(sigma, sigma[best, rows]), 2e-3))
-        weight = np.where(agree, 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+        agree = apart <= np.maximum(4.0 * np.hypot(sigma, sigma[best, rows]), 2e-3)
+        weight = np.where(agree & np.isfinite(sigma), 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
         total = weight.sum(axis=0)
-        some = total > 0
-        averaged = {"points": points, "range_m": source.range_m[group], "intensity": source.intensity[group]}
-        for name, values in (averaged | {"column_px": source.column_px[group]}).items():
-            w, t = (weight[..., None], total[:, None]) if values.ndim == 3 else (weight, total)
-            self._fields[name][k, some] = (np.where(w > 0, values, 0.0) * w).sum(axis=0)[some] / t[some]
-        self._fields["sigma_m"][k, some] = 1.0 / np.sqrt(total[some])
-        self._fields["reason"][k] = source.reason[group][best, rows]
-        self._bearings[k] = source.bearings[group].mean()
+        with np.errstate(invalid="ignore"):
+            share = weight / total  # NaN in rows that no column measured, and so is their mean
+        column: dict[str, NDArray[Any]] = {"reason": reason[best, rows]}
+        column["points"] = _weighted_mean(points, share[..., None])
+        for name in ("range_m", "intensity", "column_px"):
+            column[name] = _weighted_mean(self._fields[name][group], share)
+        column["sigma_m"] = 1.0 / np.sqrt(np.where(total > 0, total, np.nan))
+        return column
 
     def _view(self, name: str) -> F32:
         values: F32 = self._fields[name][: self._count]
@@ -179,3 +195,43 @@ class Scan:
 
         self._bearings = grown(self._bearings)
         self._fields = {name: grown(values) for name, values in self._fields.items()}
+
+
+def bearing_columns(bearings: F64, tolerance: float) -> tuple[F64, list[NDArray[np.intp]]]:
+    """Which bearings are one column of the range image.
+
+    Args:
+        bearings: (N,) [rad], in any order, over any number of turns.
+        tolerance: [rad].
+
+    Returns:
+        The bearings brought into one turn, (N,), and the indices of each column's members, columns ascending.
+
+    No member is farther than the tolerance from the first of its column, so a fine sweep cannot chain into a single
+    one; columns whose means come that close are joined, so that a second grouping changes nothing.
+    """
+    bearings = np.array(bearings, np.float64)
+    groups = [np.array([k]) for k in np.argsort(bearings, kind="stable")]
+    while groups:
+        means = np.array([bearings[group].mean() for group in groups])
+        turns = np.floor((means - means.min() + tolerance) / (2.0 * np.pi))
+        for group, turn in zip(groups, turns, strict=True):
+            bearings[group] -= 2.0 * np.pi * turn
+        means = means - 2.0 * np.pi * turns
+        joined: list[list[NDArray[np.intp]]] = []
+        start = -np.inf
+        for k in np.argsort(means, kind="stable"):
+            if means[k] - start > tolerance:
+                joined.append([])
+                start = means[k]
+            joined[-1].append(groups[k])
+        settled = len(joined) == len(groups) and not turns.any()
+        groups = [np.concatenate(parts) for parts in joined]
+        if settled:
+            break
+    return bearings, groups
+
+
+def _weighted_mean(values: NDArray[Any], share: F64) -> F64:
+    mean: F64 = np.where(share == 0, 0.0, values * share).sum(axis=0)
+    return mean
