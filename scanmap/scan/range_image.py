@@ -22,6 +22,14 @@ class ScanParams(BaseModel, frozen=True, extra="forbid"):
 
     filter_outliers: bool = Field(True, description="remove points that no neighbour in the range image supports")
     merge_deg: float = Field(0.02, ge=0, description="bearings closer than this are one column [deg]")
+    support_px: float = Field(
+        0.25, ge=0, le=20, description="neighbours this close in the image are one surface, beside their noise [px]"
+    )
+    support_sigma: float = Field(4.0, ge=0, le=50, description="noise allowed between neighbours [standard deviations]")
+    max_incidence_deg: float = Field(
+        87.0, ge=45, lt=90, description="a surface seen more steeply than this is a depth edge [deg]"
+    )
+    normal_window_deg: float = Field(1.5, gt=0, le=30, description="patch a normal is fitted to [deg of view]")
 
 
 class Scan:

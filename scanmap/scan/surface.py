@@ -1,0 +1,160 @@
+"""The surface of a range image: outliers removed, normals, triangles. All of it image operations.
+
+The functions want a scan whose bearings ascend (`Scan.merged`); a scan of a full turn closes on itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline import Reason
+from scanmap.scan.links import Disparity, bearing_links, blocks, disparity, row_links
+from scanmap.scan.range_image import Scan, ScanParams
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def remove_outliers(scan: Scan, params: ScanParams | None = None) -> Scan:
+    """A copy without the points that no neighbour supports (`Reason.OUTLIER`).
+
+    A point stays if the row above or below lies on the same surface, or the next bearing does. Where the rows above
+    and below are there and the point hangs between them in depth it is a flying pixel at an edge, and the bearings
+    cannot save it.
+    """
+    params = params or ScanParams()
+    return scan.without(unsupported(scan, params), Reason.OUTLIER)
+
+
+def unsupported(scan: Scan, params: ScanParams) -> Mask:
+    """(B, H) cells with a point that no neighbour supports."""
+    halo = 2
+    d = disparity(scan, params, halo)
+    reach = _reach(params)
+    lonely = np.zeros((len(scan), scan.rows), bool)
+    for block in blocks(len(scan), scan.rows):
+        wide = slice(block.start, block.stop + 2 * halo)
+        q = d.q[block.start + halo : block.stop + halo]
+        rows = row_links(d, slice(block.start + halo, block.stop + halo), reach)
+        alone = np.isfinite(q)
+        alone[:, 1:] &= ~rows
+        alone[:, :-1] &= ~rows
+        if alone.any():
+            beside = bearing_links(d, wide, reach)
+            across = (beside[halo:-1] | beside[halo - 1 : -halo])[: len(q)]
+            with np.errstate(invalid="ignore"):
+                jump = np.diff(q, axis=1)
+                between = jump[:, 1:] * jump[:, :-1] > 0
+            across[:, 1:-1] &= ~between
+            alone &= ~across
+        lonely[block] = alone
+    return lonely
+
+
+def normals(scan: Scan, params: ScanParams | None = None) -> F32:
+    """Unit normals (B, H, 3) in the world frame, toward the head; NaN where there is no surface to fit.
+
+    Cross product of two chords through each point, one along the rows and one along the bearings, between means over
+    a patch of `normal_window_deg` that ends at depth edges. On a plane any chord lies in it, so steps need not be
+    equal and the head need not stand on the axis.
+    """
+    params = params or ScanParams()
+    result = np.full((len(scan), scan.rows, 3), np.nan, np.float32)
+    if len(scan) < 2 or scan.rows < 3:
+        return result
+    third = np.radians(params.normal_window_deg) / 3.0
+    steps = np.diff(scan.bearings)
+    along = int(np.clip(round(third / max(float(np.median(steps)), 1e-6)), 1, 16))
+    halo = along + 2
+    d = disparity(scan, params, halo)
+    down = int(np.clip(round(third / max(d.row_step, 1e-6)), 1, max(1, scan.rows // 3)))
+    order = np.arange(-halo, len(scan) + halo) % len(scan)
+    origins = scan.origins.astype(np.float32)
+    for block in blocks(len(scan), scan.rows):
+        wide = slice(block.start, block.stop + 2 * halo)
+        points = np.ascontiguousarray(np.moveaxis(scan.points[order[wide]], -1, 0))
+        points[:, np.isnan(d.q[wide])] = np.nan
+        patch = _patch_normals(points, d, wide, _reach(params), along, down)[:, halo:-halo]
+        view = origins[block].T[:, :, None] - points[:, halo:-halo]
+        patch *= np.copysign(np.float32(1.0), (patch * view).sum(axis=0))
+        result[block] = np.moveaxis(patch, 0, -1)
+    return result
+
+
+def _patch_normals(points: F32, d: Disparity, wide: slice, reach: float, along: int, down: int) -> F32:
+    """Unit normals (3, n, H) of one block of padded columns, either sign."""
+    rows = np.zeros(points.shape[1:], np.uint8)
+    rows[:, :-1] = row_links(d, wide, reach)
+    bearings = np.zeros(points.shape[1:], np.uint8)
+    bearings[:-1] = bearing_links(d, wide, reach)
+    smooth = _row_means(points, rows, down)
+    a, b = _chord(smooth, rows, down, axis=1), _chord(smooth, bearings, along, axis=0)
+    normal = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    length = np.sqrt((normal * normal).sum(axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal /= np.where(length > 0, length, np.nan)
+    normal[:, np.isnan(points[0])] = np.nan
+    return normal
+
+
+def _row_means(points: F32, links: NDArray[np.uint8], window: int) -> F32:
+    """Points (3, n, H) averaged over up to `window` rows of the same surface; as they are beside a depth edge."""
+    window |= 1
+    if window < 3:
+        return points
+    size, flat = (window, 1), (-1, points.shape[2])
+    known = np.isfinite(points[0])
+    sums = cv2.boxFilter(
+        np.where(known, points, np.float32(0.0)).reshape(flat),
+        -1,
+        size,
+        normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
+    ).reshape(points.shape)
+    count = cv2.boxFilter(known.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    whole = _shifted(_all_linked(links, window - 1, axis=1), -(window // 2), 1, False) & (count > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(whole, sums / count, points)
+
+
+def _chord(points: F32, links: NDArray[np.uint8], span: int, axis: int) -> F32:
+    """Vectors (3, n, H) from the surface before each cell to the surface after it, along `axis`.
+
+    Each end is `span` cells away where the surface reaches that far, else the next cell, else the cell itself.
+    """
+    ends = [points, points]
+    for reach in sorted({1, span}):
+        onward = _all_linked(links, reach, axis)
+        for side, sign in enumerate((1, -1)):
+            there = _shifted(points, sign * reach, axis + 1, np.nan)
+            linked = onward if sign > 0 else _shifted(onward, -reach, axis, False)
+            ends[side] = np.where(linked & np.isfinite(there[0]), there, ends[side])
+    chord: F32 = ends[0] - ends[1]
+    return chord
+
+
+def _all_linked(links: NDArray[np.uint8], count: int, axis: int) -> Mask:
+    """Whether the `count` links from each cell on are all there, (n, H); False beyond the border."""
+    kernel = np.ones((1, count) if axis == 1 else (count, 1), np.uint8)
+    eroded = cv2.erode(links, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return eroded.astype(bool)
+
+
+def _shifted(values: NDArray[Any], offset: int, axis: int, beyond: float | bool) -> NDArray[Any]:
+    """values[i + offset] at i along `axis`, `beyond` past the border."""
+    result = np.full_like(values, beyond)
+    to: list[slice] = [slice(None)] * values.ndim
+    source = to.copy()
+    size = values.shape[axis]
+    to[axis] = slice(max(0, -offset), size - max(0, offset))
+    source[axis] = slice(max(0, offset), size - max(0, -offset))
+    result[tuple(to)] = values[tuple(source)]
+    return result
+
+
+def _reach(params: ScanParams) -> float:
+    return float(np.tan(np.radians(params.max_incidence_deg)))
