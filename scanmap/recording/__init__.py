@@ -1,0 +1,18 @@
+"""Recordings: one scan as one MCAP file, and everything else that can be replayed as `Shot`s."""
+
+from scanmap.recording.info import RecordingInfo, TopicInfo, describe
+from scanmap.recording.layout import RecordingParams
+from scanmap.recording.mcap_writer import Recorder, whole_ns
+from scanmap.recording.opening import open_source
+from scanmap.recording.source import Source
+
+__all__ = [
+    "Recorder",
+    "RecordingInfo",
+    "RecordingParams",
+    "Source",
+    "TopicInfo",
+    "describe",
+    "open_source",
+    "whole_ns",
+]

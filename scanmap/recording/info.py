@@ -1,0 +1,126 @@
+"""`describe`: what a recording holds, without replaying it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from scanmap.recording import layout, mcap_records, messages
+from scanmap.recording.layout import RecordingParams
+from scanmap.recording.mcap_reader import bag_parts
+from scanmap.recording.mcap_records import DamagedError
+from scanmap.recording.messages import SECOND_NS, Fault, MalformedMessageError
+from scanmap.recording.opening import open_source
+from scanmap.recording.outline import Outline, outline
+
+
+class TopicInfo(NamedTuple):
+    """A topic of a recording."""
+
+    message_type: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What `scanmap info` says about a recording, a folder of frames, or a video."""
+
+    path: Path
+    kind: str  # `recording`, `frames` or `video`
+    source: str = ""  # the rig's name or `digital twin`; empty where nobody noted it
+    shots: int = 0  # counted, not as noted
+    duration_s: float = 0.0
+    size_bytes: int = 0
+    end_reason: str = ""  # `finished`, `interrupted`, `error: ...`; empty where nobody noted it
+    cut_at: int | None = None  # byte at which the file ends without an end; None for a whole file
+    plan: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)  # and whatever else was noted at the start
+    topics: dict[str, TopicInfo] = field(default_factory=dict)
+    has_calibration: bool = False
+    has_rig: bool = False
+    faults: tuple[Fault, ...] = ()  # noted while scanning
+
+    @property
+    def is_twin(self) -> bool:
+        """Whether the digital twin made it."""
+        return self.source == layout.DIGITAL_TWIN
+
+
+def describe(path: Path | str, params: RecordingParams | None = None) -> RecordingInfo:
+    """Look into a recording, whole or cut; images are not read.
+
+    Raises:
+        RecordingError, ConfigError: as `open_source`, except that a bag without our topics is described as well.
+    """
+    path, params = Path(path), params or RecordingParams()
+    if path.suffix == ".mcap" and path.is_file():
+        return _describe_parts(path, [outline(path)], params)
+    source = open_source(path, params)
+    if source.kind == "recording":
+        parts = bag_parts(path) if path.is_dir() else [path]
+        return _describe_parts(path, [outline(part) for part in parts], params)
+    return RecordingInfo(
+        path,
+        source.kind,
+        shots=source.count or 0,
+        has_calibration=source.has_calibration,
+        has_rig=bool(source.rig_toml),
+    )
+
+
+def _describe_parts(path: Path, parts: list[Outline], params: RecordingParams) -> RecordingInfo:
+    first, last = parts[0], parts[-1]
+    about = dict(first.metadata.get(layout.START_METADATA, {}))
+    topics: dict[str, TopicInfo] = {}
+    for part in parts:
+        for channel in part.directory.channels.values():
+            before = topics.get(channel.topic, TopicInfo("", 0)).messages
+            topics[channel.topic] = TopicInfo(channel.message_type, before + part.count(channel.topic))
+    start = min((part.first_ns for part in parts if part.first_ns is not None), default=0)
+    end = max((part.last_ns for part in parts if part.last_ns is not None), default=0)
+    source, plan = about.pop("source", ""), about.pop("plan", "")
+    about.pop("start_ns", None)
+    return RecordingInfo(
+        path,
+        "recording",
+        source=source,
+        shots=sum(part.count(params.image_topic) for part in parts),
+        duration_s=(end - start) / SECOND_NS,
+        size_bytes=sum(part.size for part in parts),
+        end_reason=last.metadata.get(layout.END_METADATA, {}).get("reason", ""),
+        cut_at=next((part.cut_at for part in parts if part.cut), None),
+        plan=_plan(plan),
+        versions=about,
+        topics=dict(sorted(topics.items())),
+        has_calibration=layout.CALIBRATION_ATTACHMENT in first.attachments,
+        has_rig=layout.RIG_ATTACHMENT in first.attachments,
+        faults=tuple(fault for part in parts for fault in _faults(part)),
+    )
+
+
+def _plan(text: str) -> dict[str, Any]:
+    try:
+        plan = json.loads(text or "{}")
+    except ValueError:
+        return {"plan": text}
+    return plan if isinstance(plan, dict) else {"plan": plan}
+
+
+def _faults(part: Outline) -> list[Fault]:
+    """Warnings and errors on the diagnostics topics."""
+    found: list[Fault] = []
+    with mcap_records.open_mcap(part.path) as file:
+        for chunk in part.diagnostics:
+            try:
+                for opcode, view in mcap_records.chunk_records(mcap_records.body(file, chunk)):
+                    if opcode != mcap_records.MESSAGE:
+                        continue
+                    message = mcap_records.message(view)
+                    channel = part.directory.channels.get(message.channel_id)
+                    if channel is not None and channel.message_type == layout.DIAGNOSTIC_ARRAY:
+                        found += messages.read_faults(message.data)
+            except (DamagedError, MalformedMessageError):
+                continue  # the reading of the shots says so
+    return [fault for fault in found if fault.level > 0]

@@ -1,0 +1,40 @@
+"""What stands where in a recording: topics, joints, attachments, metadata."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, Field
+
+CALIBRATION_ATTACHMENT = "calibration.toml"
+RIG_ATTACHMENT = "rig.toml"
+START_METADATA = "scanmap"  # written first: versions, source, plan, start_ns
+END_METADATA = "end"  # written last: reason, shots
+
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
+
+TF_STATIC_TOPIC = "/tf_static"  # a name that every ROS tool takes for granted
+DIGITAL_TWIN = "digital twin"  # `source` of everything that no real camera saw
+
+
+class RecordingParams(BaseModel, frozen=True, extra="forbid"):
+    """How scans are recorded, and where a bag that others recorded keeps things; `[recording]` in a rig's TOML."""
+
+    image_topic: str = Field(
+        "/camera/image/compressed", min_length=1, description="topic of the CompressedImage with the laser on"
+    )
+    off_topic: str = Field(
+        "/camera/off/compressed", min_length=1, description="topic of the CompressedImage with the laser off"
+    )
+    camera_info_topic: str = Field("/camera/camera_info", min_length=1, description="topic of the CameraInfo")
+    joint_topic: str = Field("/joint_states", min_length=1, description="topic of the JointState with the bearing")
+    diagnostics_topic: str = Field("/diagnostics", min_length=1, description="topic of the DiagnosticArray")
+    joint: str = Field("head", min_length=1, description="joint with the reported bearing")
+    commanded_joint: str = Field(
+        "head_commanded", min_length=1, description="joint with the commanded bearing; may be absent"
+    )
+    max_gap_s: float = Field(0.5, gt=0, le=60, description="longest gap between two bearings to interpolate across [s]")
+    min_free_mb: float = Field(200.0, ge=0, description="a scan stops before the disk has less free than this [MB]")
+    fsync_s: float = Field(1.0, ge=0, le=60, description="force what is recorded to the disk at most this often [s]")

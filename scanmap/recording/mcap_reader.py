@@ -1,0 +1,157 @@
+"""Recordings back into shots: ours, cut or damaged ones, and bags that other robots recorded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from scanmap.errors import RecordingError
+from scanmap.recording import layout, mcap_records, messages
+from scanmap.recording.assembly import Assembler
+from scanmap.recording.layout import RecordingParams
+from scanmap.recording.mcap_records import Break, Channel, DamagedError, Directory, Message, Record
+from scanmap.recording.messages import MalformedMessageError
+from scanmap.recording.outline import Outline, outline
+from scanmap.recording.source import Report, Source
+from scanmap.shot import Shot
+
+
+def mcap_source(path: Path, params: RecordingParams) -> Source:
+    """Open a recording, or a bag folder with its parts.
+
+    Raises:
+        RecordingError: not an MCAP file, unreadable, or without the topics that make shots.
+    """
+    parts = bag_parts(path) if path.is_dir() else [path]
+    outlines = [outline(part) for part in parts]
+    for found in outlines:
+        _require_topics(found, params)
+    first, last = outlines[0], outlines[-1]
+    cut = any(found.cut for found in outlines)
+    end = last.metadata.get(layout.END_METADATA, {})
+    counts = [found.count(params.image_topic) for found in outlines]
+    return Source(
+        path=path,
+        kind="recording",
+        read=lambda report: _read(outlines, params, report),
+        calibration_toml=first.attachments.get(layout.CALIBRATION_ATTACHMENT, ""),
+        rig_toml=first.attachments.get(layout.RIG_ATTACHMENT, ""),
+        metadata=dict(first.metadata.get(layout.START_METADATA, {})),
+        count=sum(counts),
+        end_reason="cut" if cut else end.get("reason", ""),
+    )
+
+
+def bag_parts(folder: Path) -> list[Path]:
+    """The .mcap files of a ROS 2 bag folder, in order.
+
+    Raises:
+        RecordingError: there are none.
+    """
+    parts = sorted(folder.glob("*.mcap"), key=lambda part: [int(n) for n in re.findall(r"\d+", part.stem)])
+    if not parts:
+        others = sorted(entry.name for entry in folder.iterdir())
+        raise RecordingError(
+            f"bag {folder} has no .mcap file, only {', '.join(others[:5])}; scanmap reads MCAP bags: "
+            "convert it with `ros2 bag convert` (storage_id: mcap)"
+        )
+    return parts
+
+
+def _require_topics(found: Outline, params: RecordingParams) -> None:
+    if found.cut and not found.directory.channels:
+        raise RecordingError(f"recording {found.path} is cut at byte {found.size}, before its first shot")
+    wanted = ((params.image_topic, layout.COMPRESSED_IMAGE), (params.joint_topic, layout.JOINT_STATE))
+    for topic, message_type in wanted:
+        if not any(_carries(channel, topic, message_type) for channel in found.directory.channels.values()):
+            raise RecordingError(_no_topic(found.path, found.directory, topic, message_type))
+
+
+def _carries(channel: Channel, topic: str, message_type: str) -> bool:
+    named = channel.message_type.replace("/msg/", "/") == message_type.replace("/msg/", "/")
+    return channel.topic == topic and named and channel.encoding == "cdr"
+
+
+def _no_topic(path: Path, directory: Directory, topic: str, message_type: str) -> str:
+    there = sorted(f"{c.topic} ({c.message_type or c.encoding})" for c in directory.channels.values())
+    key = "image_topic" if message_type == layout.COMPRESSED_IMAGE else "joint_topic"
+    return (
+        f"{path} has no {message_type} on {topic}; it has {', '.join(there) or 'no topics'}; "
+        f"name the right one with --set recording.{key}=/topic"
+    )
+
+
+def _read(outlines: list[Outline], params: RecordingParams, report: Report) -> Iterator[Shot]:
+    start = outlines[0].metadata.get(layout.START_METADATA, {}).get("start_ns", "")
+    own = start.isdecimal()
+    assembler = Assembler(params, report, int(start) if own else 0, own)
+    for found in outlines:
+        for fault in found.faults:
+            report(fault)
+        for channel, message in _data(found.path, assembler, report):
+            try:
+                _take(channel, message, params, assembler)
+            except MalformedMessageError as error:
+                report(f"{found.path}: message on {channel.topic} left out: {error}")
+            yield from assembler.ready()
+    yield from assembler.finish()
+    _account(outlines, params, assembler, report)
+
+
+def _data(path: Path, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message]]:
+    """Every message of a file in its order, with its channel; what is broken goes to `report`."""
+    directory = Directory()
+    with mcap_records.open_mcap(path) as file:
+        for record in mcap_records.walk(file):
+            if isinstance(record, Break):
+                report(_broken(path, record, assembler.done))
+            elif record.opcode in mcap_records.DATA:
+                try:
+                    for message in _messages(record, mcap_records.body(file, record), directory):
+                        if message.channel_id in directory.channels:
+                            yield directory.channels[message.channel_id], message
+                except DamagedError as error:
+                    report(f"{path}: the record at byte {record.offset} is damaged and left out: {error}")
+
+
+def _messages(record: Record, data: bytes, directory: Directory) -> Iterator[Message]:
+    chunk = record.opcode == mcap_records.CHUNK
+    for opcode, view in mcap_records.chunk_records(data) if chunk else [(record.opcode, memoryview(data))]:
+        if opcode == mcap_records.MESSAGE:
+            yield mcap_records.message(view)
+        elif opcode in (mcap_records.SCHEMA, mcap_records.CHANNEL):
+            directory.add(opcode, view)
+
+
+def _take(channel: Channel, message: Message, params: RecordingParams, assembler: Assembler) -> None:
+    if _carries(channel, params.image_topic, layout.COMPRESSED_IMAGE):
+        assembler.add_image(messages.read_image(message.data), message.sequence)
+    elif _carries(channel, params.off_topic, layout.COMPRESSED_IMAGE):
+        assembler.add_off(messages.read_image(message.data))
+    elif _carries(channel, params.joint_topic, layout.JOINT_STATE):
+        assembler.add_joints(messages.read_joints(message.data))
+
+
+def _broken(path: Path, broken: Break, done: int) -> str:
+    if broken.cut:
+        return f"recording {path} is cut at byte {broken.offset}: {done} shots before the cut were read"
+    where = f"recording {path} is damaged at byte {broken.offset}, after {done} shots"
+    return f"{where}; reading goes on at byte {broken.resumed_at}" if broken.resumed_at else where
+
+
+def _account(outlines: list[Outline], params: RecordingParams, assembler: Assembler, report: Report) -> None:
+    """Say what is missing of what was recorded, and why when nothing came."""
+    path = outlines[0].path
+    if assembler.without_bearing and params.joint not in assembler.joints_seen:
+        joints = ", ".join(sorted(assembler.joints_seen)) or "none"
+        raise RecordingError(
+            f"{path} has no joint {params.joint!r} on {params.joint_topic}; it has {joints}; "
+            "name the right one with --set recording.joint=NAME"
+        )
+    if not assembler.done:
+        raise RecordingError(f"recording {path} holds no shot that can be read")
+    noted = [found.metadata.get(layout.END_METADATA, {}).get("shots", "") for found in outlines]
+    expected = sum(int(shots) for shots in noted if shots.isdecimal())
+    if assembler.done < expected:
+        report(f"{assembler.done} of {expected} recorded shots could be read")
