@@ -1,0 +1,292 @@
+"""The stage on a GRBL board: one driver for grbl 1.1, grblHAL and FluidNC, real or twin.
+
+The head is the board's X axis and one unit is one degree. A shot's bearing is what the board reports, a whole
+number of motor steps, not what was asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from scanmap.errors import StageError
+from scanmap.rig import grbl_protocol as protocol
+from scanmap.rig.grbl_link import GrblLink
+from scanmap.rig.grbl_protocol import Dialect, Status
+from scanmap.rig.serial_port import open_serial, serial_devices
+from scanmap.rig.stage import StageParams, check_limits
+
+__all__ = ["GrblStage", "StageParams", "open_grbl"]
+
+BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
+HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
+HOLD_FOREVER = 255.0  # $1: the motor holds between moves
+IDLE_MS_DEFAULT = 25.0  # $1 of a fresh board
+REPORT_DEG = 0.001  # resolution of a status report
+STEP_DEG_UNKNOWN = 0.1  # how far off an arrival may be where the board does not tell its steps
+FAREWELL_S = 0.5  # how long the last reset may take to be confirmed
+
+logger = logging.getLogger(__name__)
+
+
+class GrblStage:
+    """A head on a GRBL board. Implements `scanmap.rig.Stage`; not thread-safe."""
+
+    def __init__(self, link: GrblLink, dialect: Dialect, params: StageParams) -> None:
+        """Take over a board that has just answered with its banner; `open_grbl` makes one.
+
+        Raises:
+            StageError: the board is in an alarm that cannot be cleared, or its settings cannot be made to fit.
+        """
+        self._link = link
+        self._params = params
+        self.dialect = dialect
+        self._settings: dict[str, float] = {}
+        self._zero_deg = 0.0  # the board's X where the head stands at home_deg
+        self._work_offset: tuple[float, ...] | None = None
+        self._from_below = False  # whether the last arrival took up the play
+        self._closed = False
+        self._prepare()
+
+    @property
+    def name(self) -> str:
+        """Firmware and port."""
+        return f"{self.dialect.value} on {self._link.name}"
+
+    @property
+    def laser_switchable(self) -> bool:
+        """False for a laser on batteries."""
+        return self._params.laser == "grbl"
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest bearing [rad]."""
+        return math.radians(self._params.min_deg), math.radians(self._params.max_deg)
+
+    def move_to(self, bearing: float) -> float:
+        """Turn to `bearing` [rad] and return the bearing reported after arrival [rad].
+
+        Raises:
+            StageError: outside the limits, no answer, reset, alarm, or not arrived.
+        """
+        target = math.degrees(bearing)
+        check_limits(target, self._params)
+        if self._params.backlash_deg:
+            here = self._where_deg()
+            if target < here or not self._from_below:
+                self._go(target - self._params.backlash_deg)
+            self._from_below = True
+        return math.radians(self._go(target))
+
+    def where(self) -> float:
+        """The bearing reported now [rad]."""
+        return math.radians(self._where_deg())
+
+    def laser(self, on: bool) -> None:
+        """Switch the laser; does nothing where it cannot be switched.
+
+        Raises:
+            StageError: no answer, or refused.
+        """
+        if self.laser_switchable:
+            self._link.command(f"M3 S{self._params.laser_s:g}" if on else "M5", despite_fault=not on)
+
+    def home(self) -> float:
+        """Find `home_deg` as `[stage] homing` says and return the bearing reported [rad].
+
+        By hand: where the head stands now is `home_deg`.
+
+        Raises:
+            StageError: no switch or mark was found.
+        """
+        if self._params.homing == "switch":
+            single = self.dialect is not Dialect.GRBL
+            self._link.command("$HX" if single else "$H", despite_fault=True, silence_s=HOMING_S)
+        else:
+            self._unlock()
+        self._link.fault = None
+        for line in self._link.preamble:
+            self._link.command(line)
+        if self._params.homing == "index":
+            self._find_index()
+        self._zero_deg = self._machine_deg(self._status())
+        self._from_below = False
+        return self.where()
+
+    def close(self) -> None:
+        """Laser off, motor free, port closed; may be called twice and never raises."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            if self.laser_switchable:
+                self._link.command("M5", despite_fault=True)
+            self._release_motor()
+        except StageError:
+            logger.warning("%s could not be shut down in order; it was told to reset", self._link.name, exc_info=True)
+        finally:
+            try:
+                self._link.send_reset()
+                self._link.await_banner(FAREWELL_S)
+            except StageError:
+                logger.warning("%s is gone: switch the laser off by hand", self._link.name)
+            self._link.close()
+
+    def _prepare(self) -> None:
+        if self._status().state == "Alarm" and self._params.homing != "switch":
+            self._unlock()
+        self._link.fault = None
+        if self.dialect.has_numbered_settings:
+            self._settings = dict(filter(None, map(protocol.parse_setting, self._link.command("$$"))))
+            self._write_settings()
+        else:
+            self._check_yaml()
+        # G1 as the standing mode: a board in laser mode lights a standing laser only then.
+        self._link.preamble = [f"G21 G90 G94 G1 F{self._params.speed_deg_s * 60:.1f}"]
+        if self._params.homing == "hand":
+            for line in self._link.preamble:
+                self._link.command(line)
+        else:
+            self.home()
+        self.laser(False)
+
+    def _write_settings(self) -> None:
+        """Bring the board's settings to the rig's, writing only what differs: its memory wears out."""
+        params = self._params
+        wanted = {"100": params.steps_per_deg, "120": params.acceleration_deg_s2, "1": HOLD_FOREVER}
+        feed = params.speed_deg_s * 60
+        if self._settings.get("110", feed) < feed:
+            wanted["110"] = feed
+        if self.laser_switchable:
+            wanted["32"] = 0.0
+        for number, value in wanted.items():
+            if value is None or math.isclose(self._settings.get(number, math.nan), value, abs_tol=6e-4):
+                continue
+            self._link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."))
+            if number != "1":
+                self._settings[number] = value
+
+    def _check_yaml(self) -> None:
+        """FluidNC keeps its machine in a file: compare, and say what to change there."""
+        steps = self._yaml_value("/axes/x/steps_per_mm")
+        wanted = self._params.steps_per_deg
+        if steps is not None:
+            self._settings["100"] = steps
+            if wanted is not None and not math.isclose(steps, wanted, rel_tol=1e-4):
+                raise StageError(
+                    f"stage {self._link.name}: axes/x/steps_per_mm is {steps:g} in the board's config.yaml, "
+                    f"stage.steps_per_deg is {wanted:g}: make them equal"
+                )
+        idle_ms = self._yaml_value("/stepping/idle_ms")
+        if idle_ms is not None and idle_ms != HOLD_FOREVER:
+            logger.warning("%s lets the motor go after %g ms: set stepping/idle_ms: 255", self._link.name, idle_ms)
+
+    def _yaml_value(self, path: str) -> float | None:
+        try:
+            answers = self._link.command(f"${path}")
+        except StageError:
+            return None
+        found = [setting for setting in map(protocol.parse_setting, answers) if setting and setting[0] == path]
+        return found[0][1] if found else None
+
+    def _unlock(self) -> None:
+        self._link.command("$X", despite_fault=True)
+        if self._status().state == "Alarm":
+            self._link.reset()
+            self._link.command("$X", despite_fault=True)
+        if self._status().state == "Alarm":
+            raise StageError(self._link.fault or f"stage {self._link.name} stays in alarm: check its limit switches")
+        self._link.fault = None
+
+    def _find_index(self) -> None:
+        """Turn toward smaller bearings until the probe input sees the mark; the board's zero moves there."""
+        travel = self._params.max_deg - self._params.min_deg
+        feed = self._params.speed_deg_s * 60 / 4
+        x = self._machine_deg(self._status()) - self._params.direction * travel
+        self._link.command(f"G53 G38.2 X{x:.3f} F{feed:.1f}", silence_s=HOMING_S)
+
+    def _go(self, target_deg: float) -> float:
+        """Move, prove the arrival, and return the bearing reported [deg]."""
+        params = self._params
+        x = self._zero_deg + params.direction * (target_deg - params.home_deg)
+        here = math.nan
+        for _ in range(2):  # a line damaged on its way can name another target
+            self._link.command(f"G53 G1 X{x:.4f} F{params.speed_deg_s * 60:.1f}")
+            self._link.command("G4 P0.01")  # answered only when all that was planned is done
+            here = self._where_deg()
+            step = 1.0 / self._settings["100"] if self._settings.get("100") else STEP_DEG_UNKNOWN
+            if abs(here - target_deg) <= step + REPORT_DEG:
+                return here
+        raise StageError(
+            f"stage {self._link.name} was asked for {target_deg:g} deg and stands at {here:g}: check for a blocked "
+            "head or a limit switch, then `scanmap stage home`"
+        )
+
+    def _where_deg(self) -> float:
+        x = self._machine_deg(self._status())
+        return self._params.home_deg + self._params.direction * (x - self._zero_deg)
+
+    def _status(self) -> Status:
+        status = self._link.status()
+        if status.work_offset is not None:
+            self._work_offset = status.work_offset
+        for _ in range(40):  # the offset comes with every 10th to 30th report
+            if not status.is_work or self._work_offset is not None:
+                break
+            status = self._link.status()
+            self._work_offset = status.work_offset
+        return status
+
+    def _machine_deg(self, status: Status) -> float:
+        """The board's X [deg], rounded to the whole motor step that it stands for."""
+        x = status.position[0]
+        if status.is_work and self._work_offset:
+            x += self._work_offset[0]
+        if self._settings.get("13"):  # reports in inches
+            x *= 25.4
+        steps = self._settings.get("100")
+        return round(x * steps) / steps if steps else x
+
+    def _release_motor(self) -> None:
+        if not self.dialect.has_numbered_settings:
+            self._link.command("$MD", despite_fault=True)
+            return
+        before = self._settings.get("1", IDLE_MS_DEFAULT)
+        # 255 was left behind by a run that was killed. The reset that follows lets the motor go.
+        idle_ms = IDLE_MS_DEFAULT if before == HOLD_FOREVER else before
+        self._link.command(f"$1={idle_ms:g}", despite_fault=True)
+
+
+def open_grbl(params: StageParams) -> GrblStage:
+    """Open the board on `params.port`; `auto` takes the first port where one answers.
+
+    Raises:
+        StageError: no port, or none where a GRBL board answers.
+    """
+    if params.port != "auto":
+        return _open_port(params.port, params)
+    faults = []
+    for device in serial_devices():
+        try:
+            return _open_port(device, params)
+        except StageError as error:
+            faults.append(f"{device}: {error}")
+    raise StageError(
+        "no GRBL board found ("
+        + ("; ".join(faults) or "no serial port on this machine")
+        + "): plug it in, or set stage.port; `scanmap doctor` lists what answers"
+    )
+
+
+def _open_port(url: str, params: StageParams) -> GrblStage:
+    port = open_serial(url, params.baud)
+    link = GrblLink(port, params.timeout_s)
+    try:
+        banner = link.await_banner(BOOT_S if "://" not in url else 0.3) or link.reset()
+        if banner.dialect is Dialect.GRBL and banner.version.startswith("0."):
+            raise StageError(f"{url} runs grbl {banner.version}: flash grbl 1.1 or newer")
+        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
+        return GrblStage(link, dialect, params)
+    except BaseException:
+        link.close()
+        raise

@@ -1,0 +1,166 @@
+"""What GRBL boards say, read into values: banner, status report, settings, errors and alarms in words.
+
+Pure functions of one line of text; noise gives `None`, never an exception. Covers grbl 1.1, grblHAL and
+FluidNC. Source: gnea/grbl, doc/markdown/interface.md and doc/csv; the two others add codes to them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from enum import Enum
+from typing import NamedTuple
+
+# Real-time bytes: acted on at once, never queued, never answered by `ok`.
+STATUS = b"?"
+HOLD = b"!"
+RESUME = b"~"
+RESET = b"\x18"
+JOG_CANCEL = b"\x85"
+
+RX_BUFFER_BYTES = 127  # what may be sent and not yet answered; real ones hold 128 or more
+
+ERRORS = {
+    1: "a G-code word lost its letter",
+    2: "a number is damaged or missing",
+    3: "the board does not know this $ command",
+    4: "a value must not be negative",
+    5: "homing is off: set $22=1, or stage.homing = 'hand'",
+    6: "the step pulse is shorter than 3 us: raise $0",
+    7: "the settings memory was damaged and went back to defaults: check $100, $110, $120",
+    8: "the board is busy: wait until it is idle",
+    9: "the board is locked by an alarm: `scanmap stage home`",
+    10: "$20=1 needs homing, $22=1",
+    11: "the line is too long",
+    12: "$100 times $110 is more steps per second than the board can make: lower the speed",
+    13: "the safety door is open: close it, or tie its input",
+    14: "the stored line is too long",
+    15: "the jog would leave the travel set by $130",
+    16: "the jog command is damaged",
+    17: "laser mode needs a PWM output: set $32=0",
+    20: "the board does not know this G-code",
+    21: "two G-codes of one modal group in a line",
+    22: "no feed rate: set stage.speed_deg_s",
+    23: "a G-code needs a whole number",
+    24: "two G-codes in a line want the axis word",
+    25: "a G-code word came twice in a line",
+    26: "an axis word is missing",
+    27: "the line number is invalid",
+    28: "a G-code lacks its P or L word",
+    30: "G53 works only with G0 and G1",
+    31: "an axis word is not used",
+    33: "the target is invalid",
+    36: "a word is not used",
+    38: "the tool number is too large",
+}
+
+ALARMS = {
+    1: "a limit switch was hit and the position is lost: free the head by hand, then `scanmap stage home`",
+    2: "the target lies outside the board's own travel: raise $130 or set $20=0; the position is kept",
+    3: "reset while moving, so the position is lost: `scanmap stage home`",
+    4: "the index sensor was already triggered: turn the head off the mark and home again",
+    5: "the index mark was not found: check the sensor, then home again",
+    6: "homing was interrupted: home again",
+    7: "the safety door opened while homing: close it and home again",
+    8: "the limit switch did not release: raise $27 or check its wiring",
+    9: "the limit switch was not found: check its wiring, $23 and $130",
+    10: "the emergency stop is pressed: release it, then `scanmap stage home`",
+    11: "the board must be homed first: `scanmap stage home`",
+    12: "a limit switch is held: turn the head off it by hand",
+    14: "the board's laser output did not answer: check its configuration",
+    17: "a motor driver reports a fault: check its power, heat and wiring",
+}
+
+
+class Dialect(Enum):
+    """Which firmware answers."""
+
+    GRBL = "grbl"
+    GRBLHAL = "grblHAL"
+    FLUIDNC = "FluidNC"
+
+    @property
+    def has_numbered_settings(self) -> bool:
+        """Whether `$100`, `$1`, `$32` exist; FluidNC keeps its machine in a YAML file instead."""
+        return self is not Dialect.FLUIDNC
+
+
+class Banner(NamedTuple):
+    """What a board says after a reset."""
+
+    dialect: Dialect
+    version: str
+
+
+class Status(NamedTuple):
+    """A status report, `<Idle|MPos:...|...>`."""
+
+    state: str  # Idle, Run, Jog, Hold, Door, Home, Alarm, Check, Sleep
+    substate: int  # Hold:0 = stands still, Hold:1 = still braking; 0 if none is given
+    position: tuple[float, ...]  # as reported: machine, or work coordinates if `is_work`
+    is_work: bool
+    work_offset: tuple[float, ...] | None  # only in some reports
+
+
+_BANNER = re.compile(r"\bGrbl(?P<hal>HAL)? (?P<version>[\d.]+\w*) ?\[(?P<rest>[^\]]*)")
+_CODE = re.compile(r"(?P<kind>error|ALARM): ?(?P<code>\d+)$")
+_SETTING = re.compile(r"\$(?P<name>[\w/]+)=(?P<value>-?\d+(\.\d+)?)\b")
+_STATES = {"Idle", "Run", "Jog", "Hold", "Door", "Home", "Alarm", "Check", "Sleep", "Tool"}
+
+
+def parse_banner(line: str) -> Banner | None:
+    """`Grbl 1.1h ['$' for help]`, `GrblHAL 1.1f [...]`, `Grbl 3.7 [FluidNC v3.7.8 ...]`."""
+    match = _BANNER.search(line)
+    if not match:
+        return None
+    if "FluidNC" in match["rest"]:
+        return Banner(Dialect.FLUIDNC, match["version"])
+    return Banner(Dialect.GRBLHAL if match["hal"] else Dialect.GRBL, match["version"])
+
+
+def dialect_of_build_info(lines: list[str], otherwise: Dialect) -> Dialect:
+    """The dialect told by the answer to `$I`, where it tells one: banners can be silenced or rebranded."""
+    text = "\n".join(lines)
+    if "FluidNC" in text:
+        return Dialect.FLUIDNC
+    return Dialect.GRBLHAL if "grblHAL" in text else otherwise
+
+
+def parse_status(line: str) -> Status | None:
+    """Read a status report; None if the line is not a whole one."""
+    if not (line.startswith("<") and line.endswith(">")):
+        return None
+    state, *fields = line[1:-1].split("|")
+    name, _, sub = state.partition(":")
+    values = dict(field.split(":", 1) for field in fields if ":" in field)
+    is_work = "WPos" in values
+    position = _numbers(values.get("WPos" if is_work else "MPos", ""))
+    if name not in _STATES or position is None or (sub and not sub.isdecimal()):
+        return None
+    return Status(name, int(sub or 0), position, is_work, _numbers(values.get("WCO", "")))
+
+
+def parse_code(line: str) -> tuple[str, int] | None:
+    """`("error", 9)` or `("ALARM", 1)`."""
+    match = _CODE.match(line)
+    return (match["kind"], int(match["code"])) if match else None
+
+
+def parse_setting(line: str) -> tuple[str, float] | None:
+    """`$100=80.000` gives `("100", 80.0)`; comments of old versions are ignored."""
+    match = _SETTING.match(line)
+    return (match["name"], float(match["value"])) if match else None
+
+
+def explain(kind: str, code: int) -> str:
+    """An error or alarm in words, with what to do."""
+    words = (ERRORS if kind == "error" else ALARMS).get(code, "see the firmware's list of codes")
+    return f"{kind}:{code}, {words}"
+
+
+def _numbers(text: str) -> tuple[float, ...] | None:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return values if all(math.isfinite(value) for value in values) else None

@@ -1,0 +1,138 @@
+"""A serial line in text: whole lines in, whole lines out, bounded time, one kind of error.
+
+Knows no firmware. Every port pyserial can open works: `/dev/ttyUSB0`, `COM3`, `socket://host:23`,
+`rfc2217://host:2217`, and `twin://name`, which `scanmap.twin` registers.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+from scanmap.errors import StageError
+
+MAX_LINE_BYTES = 4096  # a longer "line" is noise at the wrong baud rate
+
+logger = logging.getLogger(__name__)
+
+
+class SerialPort:
+    """An open port that speaks in lines. Not thread-safe."""
+
+    def __init__(self, port: Any, name: str) -> None:
+        """`port` is an open pyserial object with a read timeout of a few hundredths of a second."""
+        self._port = port
+        self._buffer = bytearray()
+        self.name = name
+
+    def write(self, data: bytes) -> None:
+        """Send bytes as they are.
+
+        Raises:
+            StageError: the port is gone, or takes nothing for two seconds.
+        """
+        logger.debug("%s <- %r", self.name, data)
+        try:
+            self._port.write(data)
+        except (OSError, ValueError) as error:
+            raise self._gone(error) from error
+
+    def write_line(self, line: str) -> None:
+        """Send one line of ASCII, ended by a newline."""
+        self.write(line.encode("ascii") + b"\n")
+
+    def read_line(self, timeout_s: float) -> str | None:
+        """The next line that is not empty, without its end; None if none came in time.
+
+        Bytes outside ASCII become `?`: noise must not raise.
+
+        Raises:
+            StageError: the port is gone.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            line = self._take_line()
+            if line is not None:
+                logger.debug("%s -> %s", self.name, line)
+                return line
+            try:
+                self._buffer += self._port.read(max(1, self._port.in_waiting))
+            except (OSError, ValueError, TypeError) as error:  # pyserial on a closed POSIX port: TypeError
+                raise self._gone(error) from error
+            if b"\n" not in self._buffer and time.monotonic() >= deadline:
+                return None
+
+    def drain(self) -> list[str]:
+        """Lines that have already arrived, without waiting."""
+        lines = []
+        while (line := self.read_line(0.0) if self._pending() else None) is not None:
+            lines.append(line)
+        return lines
+
+    def close(self) -> None:
+        """Free the port; may be called twice and never raises."""
+        try:
+            self._port.close()
+        except (OSError, ValueError):
+            logger.debug("%s did not close cleanly", self.name, exc_info=True)
+
+    def _pending(self) -> bool:
+        try:
+            return b"\n" in self._buffer or bool(self._port.in_waiting)
+        except (OSError, ValueError, TypeError) as error:
+            raise self._gone(error) from error
+
+    def _take_line(self) -> str | None:
+        while b"\n" in self._buffer:
+            raw, _, rest = self._buffer.partition(b"\n")
+            self._buffer = rest
+            line = raw.decode("ascii", errors="replace").replace("\ufffd", "?").strip("\r\0 \t")
+            if line:
+                return line
+        if len(self._buffer) > MAX_LINE_BYTES:
+            self._buffer.clear()
+        return None
+
+    def _gone(self, error: Exception) -> StageError:
+        return StageError(
+            f"stage {self.name} is gone ({error}): plug the board in again, check its cable and power, "
+            "then run `scanmap doctor`"
+        )
+
+
+def open_serial(url: str, baud: int) -> SerialPort:
+    """Open a device or URL at `baud`, 8N1, for this program alone.
+
+    Raises:
+        StageError: no such port, no permission, or in use.
+    """
+    import serial
+
+    try:
+        port = serial.serial_for_url(
+            url, baudrate=baud, timeout=0.02, write_timeout=2.0, exclusive=None if "://" in url else True
+        )
+    except (OSError, ValueError) as error:
+        raise StageError(_why_not_open(url, error)) from error
+    return SerialPort(port, url)
+
+
+def serial_devices() -> list[str]:
+    """Names of the serial ports of this machine that have hardware behind them, likely boards first."""
+    from serial.tools import list_ports
+
+    ports = [port for port in list_ports.comports() if port.hwid != "n/a"]
+    return [port.device for port in sorted(ports, key=lambda port: (port.vid is None, port.device))]
+
+
+def _why_not_open(url: str, error: Exception) -> str:
+    found = ", ".join(serial_devices()) or "none"
+    text = str(error)
+    if "Permission" in text or "Access is denied" in text:
+        advice = "add yourself to the group `dialout` (`sudo usermod -aG dialout $USER`, log in again)"
+    elif "lock" in text or "busy" in text:
+        advice = "another program holds it: close that one"
+    else:
+        advice = f"ports of this machine: {found}; set stage.port, or try `scanmap doctor`"
+    return f"stage port {url!r} cannot be opened ({text}): {advice}"

@@ -1,0 +1,165 @@
+"""Sweeps: plans, the order of frames, limits, retries, and the laser off however it ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scanmap.errors import CameraError, ConfigError, StageError
+from scanmap.rig import Frame, Rig
+from scanmap.rig.stage import StageParams, open_stage
+from scanmap.sweep import SweepParams, plan, sweep
+from scanmap.twin.firmware import Firmware
+from scanmap.twin.ports import plug
+
+
+class FakeCamera:
+    """Writes the true bearing and the laser into its pictures; can fail at will."""
+
+    width, height = 8, 6
+
+    def __init__(self, firmware: Firmware) -> None:
+        self.firmware = firmware
+        self.fail_at: set[int] = set()
+        self.grabs = 0
+        self.closed = False
+
+    def grab(self) -> Frame:
+        self.grabs += 1
+        if self.grabs in self.fail_at:
+            raise CameraError("truncated frame")
+        self.firmware.wait(0.05)
+        laser = "on" if self.firmware.laser_on else "off"
+        return Frame(f"{math.degrees(self.firmware.bearing):.4f} {laser}".encode(), self.firmware.now)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def firmware() -> Firmware:
+    return Firmware()
+
+
+@pytest.fixture
+def rig(firmware: Firmware) -> Iterator[Rig]:
+    with plug(firmware) as url:
+        stage = open_stage(StageParams(port=url, timeout_s=0.3))
+        with Rig(FakeCamera(firmware), stage, "digital twin", is_twin=True) as rig:
+            yield rig
+
+
+def picture(image: bytes | None) -> tuple[float, str]:
+    assert image is not None
+    bearing, laser = image.split()
+    return float(bearing), laser.decode()
+
+
+def test_default_plan_is_181_bearings_a_degree_apart() -> None:
+    planned = plan(SweepParams())
+    np.testing.assert_allclose(np.degrees(planned.bearings), np.arange(181), atol=1e-12)
+    assert planned.time_s > 181 * 0.15
+
+
+@given(start=st.floats(0, 180), end=st.floats(0, 180), step=st.floats(0.05, 200), passes=st.integers(1, 4))
+def test_a_plan_stays_between_its_ends_in_equal_steps(start: float, end: float, step: float, passes: int) -> None:
+    planned = plan(SweepParams(start_deg=start, end_deg=end, step_deg=step, passes=passes))
+    bearings = np.degrees(planned.bearings).reshape(passes, -1)
+    assert bearings[0, 0] == pytest.approx(start, abs=1e-9)
+    assert bearings.min() >= min(start, end) - 1e-6
+    assert bearings.max() <= max(start, end) + 1e-6
+    np.testing.assert_allclose(np.abs(np.diff(bearings)), step, atol=1e-9)
+    assert abs(end - bearings[0, -1]) < step + 1e-6
+    for odd in bearings[1::2]:
+        np.testing.assert_array_equal(odd, bearings[0, ::-1])
+
+
+@pytest.mark.parametrize("change", [{"end_deg": 181.0}, {"start_deg": -1.0}, {"end_deg": 360.0}])
+def test_more_than_the_cable_allows_is_refused_before_anything_moves(
+    rig: Rig, firmware: Firmware, change: dict[str, float]
+) -> None:
+    with pytest.raises(ConfigError, match=r"outside 0 to 180 deg.*stage\.max_deg"):
+        sweep(rig, SweepParams(**change))
+    assert firmware.bearing == 0.0
+
+
+def test_limits_raised_on_purpose_are_obeyed(firmware: Firmware) -> None:
+    with plug(firmware) as url:
+        stage = open_stage(StageParams(port=url, max_deg=360.0))
+        with Rig(FakeCamera(firmware), stage, "digital twin", is_twin=True) as rig:
+            shots = list(sweep(rig, SweepParams(end_deg=350, step_deg=50), sleep=firmware.wait))
+    assert shots[-1].bearing == pytest.approx(math.radians(350))
+
+
+def test_each_shot_carries_what_the_stage_reported_and_the_laser_was_right(rig: Rig, firmware: Firmware) -> None:
+    params = SweepParams(step_deg=7.003, off_frames=True, passes="forward-backward")
+    shots = list(sweep(rig, params, sleep=firmware.wait))
+    assert [shot.index for shot in shots] == list(range(52))
+    times = [shot.time for shot in shots]
+    assert times[0] == 0.0
+    assert times == sorted(times)
+    for shot in shots:
+        where, laser = picture(shot.image)
+        assert laser == "on"
+        assert picture(shot.background) == (where, "off")
+        assert math.degrees(shot.bearing) == pytest.approx(where, abs=1e-4)
+        assert abs(math.degrees(shot.bearing - shot.bearing_commanded)) <= 1 / 80
+    assert any(shot.bearing != shot.bearing_commanded for shot in shots)
+    assert not firmware.laser_on
+    assert firmware.bearing == 0.0
+
+
+def test_without_off_frames_there_is_no_background(rig: Rig, firmware: Firmware) -> None:
+    assert all(shot.background is None for shot in sweep(rig, SweepParams(step_deg=30), sleep=firmware.wait))
+
+
+def test_a_failed_frame_is_taken_again(rig: Rig, firmware: Firmware) -> None:
+    rig.camera.fail_at = {2, 3, 7}  # type: ignore[attr-defined]
+    shots = list(sweep(rig, SweepParams(step_deg=30), sleep=firmware.wait))
+    assert len(shots) == 7
+
+
+def test_a_camera_that_stays_broken_ends_the_sweep_with_the_laser_off(rig: Rig, firmware: Firmware) -> None:
+    rig.camera.fail_at = set(range(4, 100))  # type: ignore[attr-defined]
+    shots = sweep(rig, SweepParams(step_deg=30, retries=2), sleep=firmware.wait)
+    assert [next(shots).index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(CameraError, match=r"no usable frame after 3 tries: truncated frame.*sweep\.retries"):
+        next(shots)
+    assert not firmware.laser_on
+    assert firmware.bearing == 0.0
+
+
+def test_stop_ends_in_order(rig: Rig, firmware: Firmware) -> None:
+    shots = sweep(rig, SweepParams(step_deg=10), stop=lambda: firmware.bearing > 1.0, sleep=firmware.wait)
+    assert len(list(shots)) == 7
+    assert not firmware.laser_on
+    assert firmware.bearing == 0.0
+
+
+@pytest.mark.parametrize("ending", ["close", "throw"])
+def test_left_in_the_middle_the_laser_is_off_and_the_head_parked(rig: Rig, firmware: Firmware, ending: str) -> None:
+    shots = sweep(rig, SweepParams(step_deg=10), sleep=firmware.wait)
+    next(shots)
+    next(shots)
+    assert firmware.laser_on
+    if ending == "close":
+        shots.close()  # type: ignore[attr-defined]
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            shots.throw(KeyboardInterrupt)  # type: ignore[attr-defined]
+    assert not firmware.laser_on
+    assert firmware.bearing == 0.0
+
+
+def test_an_unplugged_stage_is_one_clear_error_and_every_shot_before_it_counts(rig: Rig, firmware: Firmware) -> None:
+    shots = sweep(rig, SweepParams(step_deg=10), sleep=firmware.wait)
+    seen = [next(shots) for _ in range(5)]
+    firmware.faults.unplugged = True
+    with pytest.raises(StageError, match=r"twin://head is gone .*plug the board in"):
+        next(shots)
+    assert len(seen) == 5
