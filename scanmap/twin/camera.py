@@ -1,0 +1,191 @@
+"""`TwinCamera`: renders what the calibration's camera would see of the room at the stage's true bearing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scanmap.calibration import Calibration
+from scanmap.geometry import transform
+from scanmap.rig import Frame
+from scanmap.twin.laser import LaserFan, LaserParams, LineLight
+from scanmap.twin.light import LightParams
+from scanmap.twin.optics import Lens
+from scanmap.twin.scene import RoomParams, Scene
+from scanmap.twin.sensor import Coded, Sensor, SensorParams
+
+F32 = NDArray[np.float32]
+
+COARSE = 4  # [px] the room is cast in steps of this, and finely only at its edges
+EDGE_DN = 3.0  # contrast [grey levels] from which a place counts as an edge
+
+
+class TwinParams(RoomParams, frozen=True, extra="forbid"):
+    """The digital twin; `[twin]` and its tables in a rig's TOML."""
+
+    seed: int = Field(1, ge=0, description="of all noise: the same seed gives the same pictures")
+    light: LightParams = LightParams()
+    laser: LaserParams = LaserParams()
+    sensor: SensorParams = SensorParams()
+
+
+class _Backdrop(NamedTuple):
+    """The room without the laser at one bearing."""
+
+    bearing: float
+    coded: Coded  # (H, W, 3)
+    amplitude: NDArray[np.uint8]  # (H, W, 3) noise, 16ths of a grey level
+
+
+class TwinCamera:
+    """A `Camera` (see `scanmap.rig`) that looks at a scene.
+
+    Args:
+        scene: the room, from `build_scene`.
+        calibration: the head as it truly is.
+        params: laser and sensor.
+        state: gives the stage's true bearing [rad] and whether the laser is on, at the moment it is called.
+        rng: of noise and speckle; left out, one from `params.seed`.
+        clock: [s] monotonic.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        calibration: Calibration,
+        params: TwinParams,
+        state: Callable[[], tuple[float, bool]],
+        *,
+        rng: np.random.Generator | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        own = calibration.intrinsics
+        self._scene, self._calibration, self._params = scene, calibration, params
+        self._state, self._clock = state, clock
+        self._rng = np.random.default_rng(params.seed) if rng is None else rng
+        self._sensor = Sensor(params.sensor, own.width, own.height, self._rng)
+        self._fan = LaserFan(scene, calibration, params.laser, params.sensor.blur_px)
+        self._speckle = _speckle_tile(params.laser.speckle, own.height, self._rng)
+        self._coarse_size = (max(2, own.width // COARSE), max(2, own.height // COARSE))
+        self._coarse_rays = self._rays(*_grid(own.width, own.height, *self._coarse_size))
+        self._fine_rays = self._rays(*_grid(own.width, own.height, own.width, own.height))
+        self._backdrop: _Backdrop | None = None
+
+    @property
+    def width(self) -> int:
+        """Image width [px]."""
+        return self._calibration.intrinsics.width
+
+    @property
+    def height(self) -> int:
+        """Image height [px]."""
+        return self._calibration.intrinsics.height
+
+    def grab(self) -> Frame:
+        """A picture of the room at the bearing and with the laser as they are now."""
+        bearing, laser_on = self._state()
+        now = self._clock()
+        backdrop = self._backdrop
+        if backdrop is None or backdrop.bearing != bearing:
+            backdrop = self._backdrop = self._look(bearing)
+        if not laser_on:
+            return Frame(self._sensor.read_out(backdrop.coded, backdrop.amplitude), now)
+        coded, amplitude = backdrop.coded.copy(), backdrop.amplitude.copy()
+        self._add_line(coded, amplitude, self._fan.draw(self._fan.trace(bearing)))
+        return Frame(self._sensor.read_out(coded, amplitude), now)
+
+    def close(self) -> None:
+        """Free nothing: there is no device."""
+
+    def _rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> F32:
+        """Directions (N, 3) in the head frame."""
+        R = self._calibration.T_head_camera[:3, :3].astype(np.float32)
+        return Lens(self._calibration).rays(columns, rows) @ R.T
+
+    def _look(self, bearing: float) -> _Backdrop:
+        """The room coarsely everywhere, and pixel by pixel where the coarse picture has contrast."""
+        T_world_head = self._calibration.mount.T_world_head(bearing)
+        origin = transform(T_world_head, self._calibration.T_head_camera[:3, 3])
+        R = T_world_head[:3, :3].astype(np.float32)
+        through = self._params.sensor.filter_rgb
+        coarse_shape = (self._coarse_size[1], self._coarse_size[0], 3)
+        light = (self._scene.radiance(origin, self._coarse_rays @ R.T) * through).reshape(coarse_shape)
+        glare = self._params.sensor.glare * _blurred(light, self._params.sensor.glare_px / COARSE)
+        rough = self._sensor.code(light + glare)
+        size = (self.width, self.height)
+        coded = np.asarray(cv2.resize(rough, size, interpolation=cv2.INTER_LINEAR), np.int16)
+        square = np.ones((3, 3), np.uint8)
+        contrast = (cv2.dilate(rough, square) - cv2.erode(rough, square)).max(axis=2)
+        edge = cv2.resize((contrast > 64 * EDGE_DN).view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        at = np.flatnonzero(edge)
+        fine = self._scene.radiance(origin, self._fine_rays[at] @ R.T) * through
+        row, column = np.divmod(at, self.width)
+        scale = (coarse_shape[0] / self.height, coarse_shape[1] / self.width)
+        fine += glare[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
+        coded.reshape(-1, 3)[at] = self._sensor.code(fine)
+        if self._params.sensor.blur_px > 0:
+            coded = np.asarray(cv2.GaussianBlur(coded, (3, 3), self._params.sensor.blur_px), np.int16)
+        return _Backdrop(bearing, coded, self._sensor.noise_amplitude(coded))
+
+    def _add_line(self, coded: Coded, amplitude: NDArray[np.uint8], line: LineLight) -> None:
+        """Add the laser's light to a coded picture, with speckle and glare."""
+        if not line.light.size:
+            return
+        light = line.light * self._params.sensor.filter_rgb
+        if self._params.laser.speckle > 0:
+            y, x = self._rng.integers(0, self._speckle.shape[0] - self.height + 1), self._rng.integers(0, 64)
+            columns = (np.arange(light.shape[1]) + x) % self._speckle.shape[1]
+            light *= self._speckle[y : y + self.height, columns, None]
+        margin = int(3.0 * self._params.sensor.glare_px) if self._params.sensor.glare > 0 else 0
+        first = max(0, line.first_column - margin)
+        last = min(self.width, line.first_column + light.shape[1] + margin)
+        ends = (line.first_column - first, last - line.first_column - light.shape[1])
+        light = np.pad(light, ((0, 0), ends, (0, 0)))
+        if margin:
+            light += self._params.sensor.glare * _blurred_coarsely(light, self._params.sensor.glare_px)
+        row, column = np.nonzero(light.max(axis=2) > 1e-4)
+        added = light[row, column]
+        column += first
+        bright = self._sensor.code(self._sensor.light(coded[row, column]) + added)
+        coded[row, column] = bright
+        amplitude[row, column] = self._sensor.noise_amplitude(bright)
+
+
+def _grid(width: int, height: int, columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel coordinates (rows * columns,) of the middles of an even grid of cells over the picture."""
+    u = (np.arange(columns) + 0.5) * width / columns - 0.5
+    v = (np.arange(rows) + 0.5) * height / rows - 0.5
+    return np.tile(u, rows), np.repeat(v, columns)
+
+
+def _blurred(light: F32, sigma: float) -> F32:
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), max(sigma, 0.3)), np.float32)
+
+
+def _blurred_coarsely(light: F32, sigma: float) -> F32:
+    """Wide Gaussian blur by way of a smaller picture."""
+    height, width = light.shape[:2]
+    size = (max(1, width // COARSE), max(1, height // COARSE))
+    small = np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(_blurred(small, sigma / COARSE), (width, height)), np.float32)
+
+
+def _speckle_tile(contrast: float, height: int, rng: np.random.Generator) -> F32:
+    """Factors (height + 256, 512) around 1 with standard deviation `contrast`, grains a pixel or two wide.
+
+    Source: integrated speckle is gamma-distributed (Goodman 1975).
+    """
+    if contrast == 0:
+        return np.ones((height + 256, 512), np.float32)
+    grain = _blurred(rng.standard_normal((height + 256, 512), np.float32), 0.6)
+    grain /= grain.std()
+    # Wilson-Hilferty: a gamma variable of shape 1/contrast^2 from a normal one.
+    ninth = np.float32(contrast**2 / 9.0)
+    factors: F32 = np.maximum(1.0 - ninth + np.sqrt(ninth) * grain, 0.0) ** 3
+    return factors
