@@ -1,0 +1,25 @@
+"""`scanmap config`: the effective configuration."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+ConfigOption = Annotated[
+    str | None, typer.Option("--config", metavar="FILE|PRESET", help="A rig's TOML, or the name of a preset.")
+]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key: sweep.step_deg=0.5. Repeatable.")
+]
+CalibrationOption = Annotated[
+    str | None,
+    typer.Option("--calibration", metavar="FILE", help="calibration.toml of the head; goes before all others."),
+]
+
+
+def config(config: ConfigOption = None, set_: SetOption = None) -> None:
+    """Print the effective configuration as TOML, every key with its unit, meaning and limits."""
+    from scanmap.config import load
+
+    print(load(config, set_ or ()).explained(), end="")

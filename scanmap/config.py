@@ -1,0 +1,220 @@
+"""`Config`: everything a user can set, as TOML; strict, frozen, every fault reported at once.
+
+Each room of the house brings its own `...Params`; a section here is only its name. `--set key=value`
+changes single keys; a configuration is a preset's name, a path, or nothing for the defaults.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, Field, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticUndefined
+
+from scanmap.calibration import Calibration, CalibrationFile
+from scanmap.errors import CalibrationError, ConfigError
+from scanmap.grid import GridParams
+from scanmap.laserline import LaserLineParams
+from scanmap.recording import RecordingParams
+from scanmap.rig.stage import StageParams
+from scanmap.scan import ScanParams
+from scanmap.sweep import SweepParams
+from scanmap.triangulation import TriangulationParams
+from scanmap.twin import TwinParams
+from scanmap.view import ViewParams
+
+DEFAULT_PRESET = "twin-room"
+
+
+class Config(BaseModel, frozen=True, extra="forbid"):
+    """One rig and how it scans; the whole of a rig's TOML."""
+
+    description: str = Field("", description="what this rig is, for people")
+    rig: Literal["twin", "replay-only"] = Field(
+        "twin", description="twin: the digital twin; replay-only: for recordings of a head that is not here"
+    )
+    calibration: str | CalibrationFile | None = Field(
+        None, description="path of a calibration.toml, or its tables inline; left out: the recording's own"
+    )
+    sweep: SweepParams = SweepParams()
+    laserline: LaserLineParams = LaserLineParams(pool_rows=9)
+    triangulation: TriangulationParams = TriangulationParams()
+    scan: ScanParams = ScanParams()
+    grid: GridParams = GridParams()
+    recording: RecordingParams = RecordingParams()
+    view: ViewParams = ViewParams()
+    stage: StageParams = StageParams()
+    twin: TwinParams = TwinParams()
+
+    def head(self) -> Calibration:
+        """The calibration this configuration names.
+
+        Raises:
+            CalibrationError: it names none, or the file is damaged.
+        """
+        if self.calibration is None:
+            raise CalibrationError(
+                "no calibration: give --calibration calibration.toml, or set calibration in the configuration"
+            )
+        if isinstance(self.calibration, CalibrationFile):
+            return self.calibration.build()
+        return Calibration.load(self.calibration)
+
+    def dumps(self) -> str:
+        """This configuration as TOML; `parse` gives the same configuration back."""
+        import tomli_w
+
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+    def explained(self) -> str:
+        """This configuration as TOML in which every key says its meaning, unit and limits."""
+        return "\n".join(_explain(self, ())) + "\n"
+
+
+def preset_names() -> list[str]:
+    """Names of the configurations that come with scanmap."""
+    return sorted(entry.name.removesuffix(".toml") for entry in _presets().iterdir() if entry.name.endswith(".toml"))
+
+
+def load(name: str | None, settings: Iterable[str] = ()) -> Config:
+    """Read a configuration and change single keys.
+
+    Args:
+        name: path of a TOML file, the name of a preset (`configs/thesis.toml` and `thesis` are the same
+            preset where no such file exists), or None for the default, the twin's room.
+        settings: `key=value` with dotted keys, the value in TOML's form (`sweep.step_deg=0.5`).
+
+    Raises:
+        ConfigError: not found, not TOML, or faulty; every fault with its path and what is allowed.
+    """
+    text, source, folder = _read(name or DEFAULT_PRESET)
+    return parse(text, source, settings, folder)
+
+
+def parse(text: str, source: str, settings: Iterable[str] = (), folder: Path | None = None) -> Config:
+    """`Config` from TOML text; relative calibration paths count from `folder`. Raises as `load`."""
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source} is not valid TOML: {error}") from error
+    calibration = document.get("calibration")
+    if isinstance(calibration, str) and folder is not None:
+        document["calibration"] = str(folder / calibration)
+    for setting in settings:
+        _apply(document, setting)
+    try:
+        # By way of JSON, strictly: a TOML array is a tuple, but text is never taken for a number.
+        return Config.model_validate_json(json.dumps(document, default=str), strict=True)
+    except ValidationError as error:
+        faults = sorted({_fault(detail, document) for detail in error.errors()})
+        raise ConfigError(
+            f"{source}: " + "; ".join(faults) + ". `scanmap config` lists every key with its meaning"
+        ) from error
+
+
+def _presets() -> Any:
+    return files("scanmap") / "configs"
+
+
+def _read(name: str) -> tuple[str, str, Path | None]:
+    path = Path(name)
+    try:
+        if path.is_file():
+            return path.read_text(encoding="utf-8"), str(path), path.parent
+        preset = path.stem if path.suffix == ".toml" and path.parent.name in ("", "configs") else name
+        if preset in preset_names():
+            return (_presets() / f"{preset}.toml").read_text(encoding="utf-8"), f"preset {preset}", None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"configuration {name} cannot be read: {error}") from error
+    raise ConfigError(f"no configuration {name}: neither a file nor one of the presets {', '.join(preset_names())}")
+
+
+def _apply(document: dict[str, Any], setting: str) -> None:
+    key, equals, value = setting.partition("=")
+    path = key.strip().split(".")
+    if not equals or not all(path):
+        raise ConfigError(f"--set {setting}: not of the form key=value; try --set sweep.step_deg=0.5")
+    table = document
+    for part in path[:-1]:
+        below = table.setdefault(part, {})
+        if not isinstance(below, dict):
+            raise ConfigError(f"--set {setting}: {part} is a value, not a section")
+        table = below
+    try:
+        table[path[-1]] = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        table[path[-1]] = value.strip()
+
+
+def _fault(detail: ErrorDetails, document: Mapping[str, Any]) -> str:
+    """One fault in words: path, the bad value, what is allowed."""
+    path = tuple(part for part in detail["loc"] if not (isinstance(part, str) and part in ("str", "CalibrationFile")))
+    where = ".".join(str(part) for part in path) or "configuration"
+    if detail["type"] == "extra_forbidden":
+        return f"{where} is no key here; valid: {', '.join(_keys_beside(path))}"
+    message = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] == "missing" or isinstance(detail["input"], dict):
+        return f"{where}: {message}"
+    return f"{where} = {detail['input']!r}: {message}"
+
+
+def _keys_beside(path: tuple[int | str, ...]) -> list[str]:
+    model: type[BaseModel] = Config
+    for part in path[:-1]:
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        candidates = [annotation, *get_args(annotation)]
+        models = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
+        if not models:
+            break
+        model = models[0]
+    return list(model.model_fields)
+
+
+def _explain(model: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
+    """TOML lines of one table: plain keys first, as TOML wants it, then the tables below."""
+    import tomli_w
+
+    tables = []
+    for name, info in type(model).model_fields.items():
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            tables.append((name, value, info))
+            continue
+        note = "".join((info.description or "", _limits(info)))
+        if value is None or value == {}:
+            yield f"# {name} =  # {note}"
+            continue
+        plain = model.model_dump(mode="json", include={name})[name]
+        line = tomli_w.dumps({name: plain}).strip()
+        yield f"{_one_line(line)}  # {note}" if note else _one_line(line)
+    for name, value, info in tables:
+        yield ""
+        about = info.description or (type(value).__doc__ or "").strip().splitlines()[0]
+        yield f"# {about}"
+        yield f"[{'.'.join((*path, name))}]"
+        yield from _explain(value, (*path, name))
+
+
+def _one_line(toml: str) -> str:
+    return (
+        " ".join(part.strip() for part in toml.splitlines()).replace("[ ", "[").replace(", ]", "]").replace(",]", "]")
+    )
+
+
+def _limits(info: FieldInfo) -> str:
+    """Limits and choices of a field as a note: ` (>= 0, <= 180)`, ` (one of a, b)`."""
+    choices = [c for c in get_args(info.annotation) if isinstance(c, str)]
+    words = [f"one of {', '.join(choices)}"] if choices else []
+    for bound, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<")):
+        for limit in info.metadata:
+            value = getattr(limit, bound, PydanticUndefined)
+            if isinstance(value, int | float) and math.isfinite(value):
+                words.append(f"{sign} {value:g}")
+    return f" ({', '.join(words)})" if words else ""

@@ -1,0 +1,190 @@
+"""A session at work: shots in, steps to every sink, results written however it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from scanmap.calibration import Calibration
+from scanmap.config import Config
+from scanmap.errors import RecordingError, ScanmapError
+from scanmap.grid import OccupancyGrid
+from scanmap.pipeline import Pipeline, Sink, Step, checked, run
+from scanmap.recording import Recorder
+from scanmap.scan import Scan
+from scanmap.scan.surface import remove_outliers
+from scanmap.session.outputs import Outputs, write_results
+from scanmap.session.summary import Summary, summarise
+from scanmap.shot import Shot
+from scanmap.twin import Truth, TruthReport
+from scanmap.view import View
+
+# While a scan runs the viewer's map is made anew this often [shots].
+MAP_EVERY = 20
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a session is."""
+
+    done: int  # shots
+    total: int | None  # None where the source does not know
+    bearing_deg: float
+    rows_found: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a session ended, and with what."""
+
+    scan: Scan  # merged and filtered
+    grid: OccupancyGrid | None  # None where the scan has no point to make one of
+    summary: Summary
+    ended: str  # finished, interrupted, or error: ...
+    error: ScanmapError | None = None  # what ended the scan early
+    faults: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    unwritten: list[tuple[Path, str]] = field(default_factory=list)
+    truth: TruthReport | None = None
+    next_commands: list[str] = field(default_factory=list)
+
+    @property
+    def floor_note(self) -> str:
+        """How the floor was found, one line; empty without a grid."""
+        return self.grid.floor.words if self.grid is not None and self.grid.floor is not None else ""
+
+
+@dataclass
+class Job:
+    """One scan or replay, opened; a context manager that closes what it holds."""
+
+    config: Config
+    calibration: Calibration
+    outputs: Outputs
+    shots: Callable[[], Iterable[Shot]]
+    total: int | None
+    comments: dict[str, Any]  # go into every file: source, software version
+    announcement: list[str] = field(default_factory=list)
+    recorder: Recorder | None = None
+    view: View | None = None
+    truth: Truth | None = None
+    source_faults: list[str] = field(default_factory=list)
+    closers: list[Callable[[], None]] = field(default_factory=list)
+
+    def __enter__(self) -> Job:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for close in reversed(self.closers):
+            close()
+
+    def run(self, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> Result:
+        """Process every shot and write the results.
+
+        A fault that ends the scan early is in the result's `error`, beside everything scanned before it.
+
+        Raises:
+            ScanmapError: the very first shot failed, so there is nothing to keep.
+        """
+        scan = Scan(self.calibration.mount, self.calibration.intrinsics.height, self.comments)
+        faults: list[str] = []
+        ended, error = "finished", None
+        try:
+            pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
+            sinks = self._sinks(scan, faults, progress)
+            run(checked(self._recorded(), self.calibration), pipeline.process, sinks, stop)
+            if stop():
+                ended = "interrupted"
+        except KeyboardInterrupt:
+            ended = "interrupted"
+        except ScanmapError as raised:
+            ended, error = f"error: {raised}", raised
+        finally:
+            self._close_recording(ended, faults)
+        if error is not None and not len(scan):
+            raise error
+        if not len(scan):
+            raise RecordingError(f"there is no shot to make a scan of ({ended})")
+        return self._finished(scan, faults, ended, error)
+
+    def _recorded(self) -> Iterator[Shot]:
+        """The shots, each in the recording before anything is done with it."""
+        for shot in self.shots():
+            yield self.recorder.write(shot) if self.recorder is not None else shot
+
+    def _sinks(self, scan: Scan, faults: list[str], progress: Callable[[Progress], None]) -> list[Sink]:
+        def collect(step: Step) -> None:
+            scan.add(step.profile, step.shot.bearing)
+            if step.fault:
+                faults.append(f"shot {step.shot.index} at {np.degrees(step.shot.bearing):.3f} deg: {step.fault}")
+                if self.recorder is not None:
+                    self.recorder.fault(step.fault, part="camera", seconds=step.shot.time)
+
+        def report(step: Step) -> None:
+            found = int(np.isfinite(step.profile.range_m).sum())
+            bearing = float(np.degrees(step.shot.bearing))
+            progress(Progress(len(scan), self.total, bearing, found, scan.rows))
+
+        sinks: list[Sink] = [collect]
+        if self.view is not None:
+            sinks += [self.view.step, self._map_while_scanning(scan, self.view)]
+        return [*sinks, report]
+
+    def _map_while_scanning(self, scan: Scan, view: View) -> Sink:
+        def show(step: Step) -> None:
+            if len(scan) % MAP_EVERY == 0 and scan.valid.any():
+                view.grid(OccupancyGrid.from_scan(scan.merged(self.config.scan.merge_deg), self.config.grid))
+
+        return show
+
+    def _close_recording(self, ended: str, faults: list[str]) -> None:
+        if self.recorder is None:
+            return
+        try:
+            self.recorder.close(ended)
+        except RecordingError as error:
+            faults.append(str(error))
+
+    def _finished(self, scan: Scan, faults: list[str], ended: str, error: ScanmapError | None) -> Result:
+        clean = finished_scan(scan, self.config)
+        grid = OccupancyGrid.from_scan(clean, self.config.grid) if clean.valid.any() else None
+        files, unwritten = write_results(clean, grid, self.outputs)
+        if self.view is not None:
+            self.view.finish(clean, grid)
+            self.view.close()
+            if self.outputs.rrd is not None:
+                files.append(self.outputs.rrd)
+        if self.recorder is not None:
+            files.append(self.recorder.path)
+        return Result(
+            scan=clean,
+            grid=grid,
+            summary=summarise(clean),
+            ended=ended,
+            error=error,
+            faults=[*self.source_faults, *faults],
+            files=files,
+            unwritten=unwritten,
+            truth=self.truth.compare(clean.points[clean.valid], clean.bearings) if self.truth is not None else None,
+            next_commands=self._next_commands(),
+        )
+
+    def _next_commands(self) -> list[str]:
+        if self.recorder is None:
+            return []
+        path = self.recorder.path
+        return [f"scanmap view {path}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
+
+
+def finished_scan(scan: Scan, config: Config) -> Scan:
+    """Passes merged, sorted by bearing, outliers removed."""
+    merged = scan.merged(config.scan.merge_deg)
+    return remove_outliers(merged, config.scan) if config.scan.filter_outliers else merged

@@ -1,0 +1,88 @@
+"""Which files a session leaves, checked before anything turns and written however the scan ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from scanmap.errors import ConfigError, ScanmapError
+from scanmap.grid import OccupancyGrid, save_map
+from scanmap.scan import Scan
+from scanmap.scan.formats import check_writable, write
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files a scan or replay was asked for."""
+
+    clouds: tuple[Path, ...] = ()  # clouds and meshes, by extension
+    map: Path | None = None  # the YAML; its image goes beside it
+    record: Path | None = None
+    rrd: Path | None = None
+    map_image: str = "pgm"  # pgm or png
+    map_mode: str = "trinary"  # trinary or scale
+
+    @classmethod
+    def of_scan(
+        cls, clouds: tuple[Path, ...], map_: Path | None, record: Path | None, rrd: Path | None, *, keep: bool
+    ) -> Outputs:
+        """What a live scan leaves: with `--out room.ply` also room.yaml and, if `keep`, the recording room.mcap.
+
+        A recording is never overwritten: where room.mcap exists, the new one is room-2.mcap.
+        """
+        stem = clouds[0].with_suffix("") if clouds else Path("scan")
+        if record is not None and record.exists():
+            raise ConfigError(f"recording {record} exists and is not overwritten; give another --record or move it")
+        if record is None and keep:
+            record = stem.with_suffix(".mcap")
+            number = 2
+            while record.exists():
+                record = stem.with_name(f"{stem.name}-{number}.mcap")
+                number += 1
+        if map_ is None and clouds:
+            map_ = stem.with_suffix(".yaml")
+        return cls(clouds, map_, record, rrd)
+
+    def check(self) -> None:
+        """Raise ConfigError unless every file can be written; before a scan is wasted on it."""
+        for path in self.clouds:
+            check_writable(path)
+        expected = ((self.map, ".yaml", "--map"), (self.record, ".mcap", "--record"), (self.rrd, ".rrd", "--rrd"))
+        for path_or_none, suffix, option in expected:
+            if path_or_none is None:
+                continue
+            if path_or_none.suffix != suffix:
+                raise ConfigError(
+                    f"{option} {path_or_none}: must end in {suffix}; try {path_or_none.with_suffix(suffix)}"
+                )
+            check_writable(path_or_none, suffixes=(suffix,))
+        asked = [path for path in (*self.clouds, self.map, self.record, self.rrd) if path is not None]
+        if len(set(asked)) < len(asked):
+            raise ConfigError("two outputs have the same name; give each its own")
+
+
+def write_results(
+    scan: Scan, grid: OccupancyGrid | None, outputs: Outputs
+) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """Write clouds and map. One that fails does not cost the others.
+
+    Returns:
+        Files written, and those that could not be with the reason.
+    """
+    written: list[Path] = []
+    failed: list[tuple[Path, str]] = []
+
+    def attempt(path: Path, action: Callable[[], object]) -> None:
+        try:
+            action()
+            written.append(path)
+        except (ScanmapError, OSError) as error:
+            failed.append((path, str(error)))
+
+    for path in outputs.clouds:
+        attempt(path, lambda path=path: write(scan, path))  # type: ignore[misc]
+    if outputs.map is not None and grid is not None:
+        map_path = outputs.map
+        attempt(map_path, lambda: save_map(grid, map_path, image_format=outputs.map_image, mode=outputs.map_mode))
+    return written, failed

@@ -1,0 +1,54 @@
+"""Open the rig a configuration names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from scanmap.calibration import Calibration
+from scanmap.config import Config
+from scanmap.rig import Rig
+from scanmap.rig.stage import open_stage
+from scanmap.twin import Truth, TwinCamera, build_scene
+from scanmap.twin.firmware import Firmware
+from scanmap.twin.ports import plug
+
+# What everything made from the twin says of its source; `recording.layout` has the same words.
+TWIN_NAME = "digital twin"
+
+
+@dataclass(frozen=True)
+class TwinRig:
+    """The twin, opened: the rig, what is true of its room, and its own clock."""
+
+    rig: Rig
+    truth: Truth
+    sleep: Callable[[float], None]  # passes the board's time: a fast-forward twin waits for nothing
+    close: Callable[[], None]
+
+
+def open_twin(config: Config, calibration: Calibration) -> TwinRig:
+    """The twin's camera, and the real GRBL driver talking to the twin's firmware over pyserial.
+
+    Raises:
+        ConfigError: the twin's room cannot be made.
+        StageError: the stage's settings do not fit the board.
+    """
+    scene = build_scene(config.twin, config.twin.light)
+    firmware = Firmware()
+    lit_for_ever = config.stage.laser == "always-on"
+    with ExitStack() as opened:
+        url = opened.enter_context(plug(firmware))
+        stage = open_stage(config.stage.model_copy(update={"kind": "grbl", "port": url}))
+        opened.callback(stage.close)
+        camera = TwinCamera(
+            scene,
+            calibration,
+            config.twin,
+            state=lambda: (firmware.bearing, lit_for_ever or firmware.laser_on),
+            clock=lambda: firmware.now,
+        )
+        rig = Rig(camera, stage, TWIN_NAME, is_twin=True)
+        return TwinRig(rig, Truth(scene, calibration, config.twin.laser), firmware.wait, opened.pop_all().close)
+    raise AssertionError("unreachable")

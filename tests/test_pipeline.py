@@ -1,0 +1,146 @@
+"""The loop: order, memory, faults, and what comes through when the source breaks."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+
+from scanmap.calibration import Calibration, CalibrationFile
+from scanmap.errors import CalibrationError, StageError
+from scanmap.laserline import LaserLineParams, Reason
+from scanmap.pipeline import Pipeline, Step, checked, run
+from scanmap.shot import Shot, encode_png
+from scanmap.triangulation import TriangulationParams
+
+W, H = 320, 240
+
+
+@pytest.fixture(scope="module")
+def head() -> Calibration:
+    document = {
+        "image": {"width": W, "height": H},
+        "head": {"baseline_m": 0.08, "beta_deg": 25.7, "alpha_deg": 32.3},
+    }
+    return CalibrationFile.model_validate(document).build()
+
+
+@pytest.fixture(scope="module")
+def pipeline(head: Calibration) -> Pipeline:
+    return Pipeline(head, LaserLineParams(), TriangulationParams())
+
+
+def picture(column: float, *, jpeg: bool = False, noise: int = 2) -> bytes:
+    rng = np.random.default_rng(int(column * 10))
+    line = 180.0 * np.exp(-0.5 * ((np.arange(W) - column) / 1.6) ** 2)
+    grey = np.clip(rng.normal(10.0 + line, noise, (H, W)), 0, 255).astype(np.uint8)
+    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    if jpeg:
+        return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
+    return encode_png(image)
+
+
+def shots(count: int, **kwargs: bool) -> list[Shot]:
+    return [Shot(k, 0.01 * k, 0.01 * k, 0.1 * k, picture(100.0 + k % 30, **kwargs)) for k in range(count)]
+
+
+def test_steps_come_in_the_order_of_the_shots(pipeline: Pipeline) -> None:
+    def slow_when_even(shot: Shot) -> Step:
+        time.sleep(0.02 * (shot.index % 2 == 0))
+        return pipeline.process(shot)
+
+    seen: list[int] = []
+    assert run(shots(12), slow_when_even, [lambda step: seen.append(step.shot.index)], workers=4) == 12
+    assert seen == list(range(12))
+
+
+def test_depth_of_the_line_is_the_analytic_one(pipeline: Pipeline, head: Calibration) -> None:
+    column = 117.0
+    step = pipeline.process(Shot(0, 0.0, 0.0, 0.0, picture(column, noise=0)))
+    f = W / (2 * np.tan(np.radians(32.3)))
+    depth = 0.08 / np.tan(np.radians(25.7) + np.arctan((column - (W - 1) / 2) / f))
+    assert step.profile.points[H // 2, 0] == pytest.approx(depth, rel=2e-3)
+    assert (step.line.reason == Reason.OK).mean() > 0.99
+
+
+def test_workers_do_not_change_a_bit(pipeline: Pipeline) -> None:
+    results = []
+    for workers in (1, 3):
+        steps: list[Step] = []
+        run(shots(8, jpeg=True), pipeline.process, [steps.append], workers=workers)
+        results.append([step.profile.points.tobytes() for step in steps])
+    assert results[0] == results[1]
+
+
+def test_source_is_never_read_far_ahead(pipeline: Pipeline) -> None:
+    taken = 0
+    behind = 0
+    done = 0
+
+    def source() -> Iterator[Shot]:
+        nonlocal taken
+        for shot in shots(40):
+            taken += 1
+            yield shot
+
+    def sink(_: Step) -> None:
+        nonlocal behind, done
+        done += 1
+        behind = max(behind, taken - done)
+
+    run(source(), pipeline.process, [sink], workers=2)
+    assert behind <= 6
+
+
+def test_shots_before_a_broken_source_reach_the_sinks(pipeline: Pipeline) -> None:
+    def breaking() -> Iterator[Shot]:
+        yield from shots(5)
+        raise StageError("the stage is gone")
+
+    steps: list[Step] = []
+    with pytest.raises(StageError, match="gone"):
+        run(breaking(), pipeline.process, [steps.append], workers=2)
+    assert [step.shot.index for step in steps] == list(range(5))
+
+
+def test_stop_ends_after_what_was_begun(pipeline: Pipeline) -> None:
+    steps: list[Step] = []
+    assert run(shots(50), pipeline.process, [steps.append], stop=lambda: len(steps) >= 3, workers=2) < 15
+
+
+def test_no_worker_outlives_the_run(pipeline: Pipeline) -> None:
+    run(shots(4), pipeline.process, [], workers=3)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("decode")]
+
+
+def test_damaged_image_is_a_fault_not_an_end(pipeline: Pipeline) -> None:
+    step = pipeline.process(Shot(3, 0.0, 0.0, 0.0, b"\xff\xd8\xff nothing"))
+    assert "decoded" in step.fault
+    assert (step.profile.reason == Reason.DAMAGED).all() and np.isnan(step.profile.range_m).all()
+
+
+def test_cut_jpeg_keeps_the_rows_above_the_cut(pipeline: Pipeline) -> None:
+    whole = picture(120.0, jpeg=True)
+    step = pipeline.process(Shot(0, 0.0, 0.0, 0.0, whole[: len(whole) * 6 // 10]))
+    found = step.line.reason == Reason.OK
+    assert "cut" in step.fault
+    assert found[: H // 4].mean() > 0.95 and not found[-H // 8 :].any()
+    assert np.abs(step.line.column_px[found] - 120.0).max() < 0.5
+
+
+def test_image_of_another_size_is_refused_before_anything_is_processed(head: Calibration) -> None:
+    other = Shot(0, 0.0, 0.0, 0.0, encode_png(np.zeros((48, 64), np.uint8)))
+    with pytest.raises(CalibrationError, match=r"64x48.*320x240"):
+        checked([other], head)
+
+
+def test_check_looks_past_a_damaged_first_image(head: Calibration) -> None:
+    bad = Shot(0, 0.0, 0.0, 0.0, b"nothing")
+    assert [shot.index for shot in checked([bad, *shots(3)[1:]], head)] == [0, 1, 2]
+
+
+def test_image_of_another_size_in_the_middle_costs_only_itself(pipeline: Pipeline) -> None:
+    step = pipeline.process(Shot(7, 0.0, 0.0, 0.0, encode_png(np.zeros((48, 64), np.uint8))))
+    assert "64x48" in step.fault and not np.isfinite(step.profile.range_m).any()
