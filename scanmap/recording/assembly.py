@@ -37,7 +37,7 @@ class Assembler:
     stamp have come, but never longer than `max_gap_s`.
     """
 
-    def __init__(self, params: RecordingParams, report: Report, start_ns: int, own: bool) -> None:
+    def __init__(self, params: RecordingParams, report: Report, start_ns: int, own: bool, off: bool) -> None:
         self._params = params
         self._report = report
         self._start_ns = start_ns
@@ -46,7 +46,7 @@ class Assembler:
         self._latest = -(1 << 62)
         self._bearings: deque[_Bearing] = deque()
         self._off: dict[int, bytes] = {}
-        self._has_off = False
+        self._latest_off: float = -math.inf if off and not own else math.inf
         self._waiting: deque[_Image] = deque()
         self.done = 0
         self.joints_seen: set[str] = set()
@@ -65,7 +65,7 @@ class Assembler:
     def add_off(self, off: StampedImage) -> None:
         """A laser-off image has come."""
         self._latest = max(self._latest, off.stamp_ns)
-        self._has_off = True
+        self._latest_off = max(self._latest_off, off.stamp_ns)
         self._off[off.stamp_ns] = off.image
 
     def add_image(self, on: StampedImage, sequence: int) -> None:
@@ -79,10 +79,10 @@ class Assembler:
             image = self._waiting[0]
             late = at_end or self._latest > image.stamp_ns + self._gap_ns
             bearing = self._bearing(image.stamp_ns)
-            background = image.background or self._off.pop(image.stamp_ns, None)
-            if not late and (bearing is None or (background is None and self._off_may_come(image.stamp_ns))):
-                if background is not None:
-                    self._waiting[0] = image._replace(background=background)
+            if image.background is None:
+                image = self._waiting[0] = image._replace(background=self._off.pop(image.stamp_ns, None))
+            off_may_come = image.background is None and self._latest_off < image.stamp_ns
+            if not late and (bearing is None or off_may_come):
                 break
             self._waiting.popleft()
             if bearing is None:
@@ -91,7 +91,11 @@ class Assembler:
                 index = image.sequence if self._own else self.done
                 self.done += 1
                 time = (image.stamp_ns - self._start_ns) / SECOND_NS
-                yield Shot(index, bearing.reported, bearing.commanded, time, image.image, background)
+                if self._own:
+                    self._bearings.clear()
+                    self.unmatched_off += len(self._off)
+                    self._off.clear()
+                yield Shot(index, bearing.reported, bearing.commanded, time, image.image, image.background)
         self._forget()
 
     def _bearing(self, stamp_ns: int) -> _Bearing | None:
@@ -112,9 +116,6 @@ class Assembler:
         turn_commanded = float(wrap_angle(after.commanded - before.commanded))
         return _Bearing(stamp_ns, before.reported + part * turn, before.commanded + part * turn_commanded)
 
-    def _off_may_come(self, stamp_ns: int) -> bool:
-        return self._has_off and not self._own and not any(off > stamp_ns for off in self._off)
-
     def _miss(self, stamp_ns: int) -> None:
         self.without_bearing += 1
         if self.without_bearing > 3:  # a bag without bearings would say so for each of its images
@@ -126,6 +127,8 @@ class Assembler:
 
     def _forget(self) -> None:
         """Keep what a waiting image, or one that comes a little late, can need."""
+        if self._own:  # kept by `ready`: stamps need not even ascend
+            return
         oldest = self._waiting[0].stamp_ns if self._waiting else self._latest
         limit = min(oldest, self._latest) - self._gap_ns
         while len(self._bearings) > 1 and self._bearings[0].stamp_ns < limit:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import zlib
+from collections.abc import Mapping
+
 from pydantic import BaseModel, Field
 
 CALIBRATION_ATTACHMENT = "calibration.toml"
 RIG_ATTACHMENT = "rig.toml"
 START_METADATA = "scanmap"  # written first: versions, source, plan, start_ns
 END_METADATA = "end"  # written last: reason, shots
+METADATA_CRC = "crc32"  # the format guards messages and attachments by a CRC, but not metadata
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -38,3 +43,9 @@ class RecordingParams(BaseModel, frozen=True, extra="forbid"):
     max_gap_s: float = Field(0.5, gt=0, le=60, description="longest gap between two bearings to interpolate across [s]")
     min_free_mb: float = Field(200.0, ge=0, description="a scan stops before the disk has less free than this [MB]")
     fsync_s: float = Field(1.0, ge=0, le=60, description="force what is recorded to the disk at most this often [s]")
+
+
+def metadata_crc(metadata: Mapping[str, str]) -> str:
+    """CRC-32 of the other entries of a metadata record, as it stands beside them."""
+    rest = {key: value for key, value in metadata.items() if key != METADATA_CRC}
+    return f"{zlib.crc32(json.dumps(rest, sort_keys=True).encode()):08x}"

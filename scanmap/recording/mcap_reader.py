@@ -40,6 +40,7 @@ def mcap_source(path: Path, params: RecordingParams) -> Source:
         metadata=dict(first.metadata.get(layout.START_METADATA, {})),
         count=sum(counts),
         end_reason="cut" if cut else end.get("reason", ""),
+        faults=[fault for found in outlines for fault in found.faults],
     )
 
 
@@ -85,11 +86,12 @@ def _no_topic(path: Path, directory: Directory, topic: str, message_type: str) -
 def _read(outlines: list[Outline], params: RecordingParams, report: Report) -> Iterator[Shot]:
     start = outlines[0].metadata.get(layout.START_METADATA, {}).get("start_ns", "")
     own = start.isdecimal()
-    assembler = Assembler(params, report, int(start) if own else 0, own)
+    off = any(found.count(params.off_topic) for found in outlines)
+    assembler = Assembler(params, report, int(start) if own else 0, own, off)
     for found in outlines:
         for fault in found.faults:
             report(fault)
-        for channel, message in _data(found.path, assembler, report):
+        for channel, message in _data(found, assembler, report):
             try:
                 _take(channel, message, params, assembler)
             except MalformedMessageError as error:
@@ -99,9 +101,9 @@ def _read(outlines: list[Outline], params: RecordingParams, report: Report) -> I
     _account(outlines, params, assembler, report)
 
 
-def _data(path: Path, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message]]:
+def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message]]:
     """Every message of a file in its order, with its channel; what is broken goes to `report`."""
-    directory = Directory()
+    path, directory = found.path, found.directory
     with mcap_records.open_mcap(path) as file:
         for record in mcap_records.walk(file):
             if isinstance(record, Break):

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
+
+import cv2
+import numpy as np
 
 import scanmap
 from scanmap.calibration import Calibration
@@ -78,6 +84,7 @@ class Recorder:
         self._calibration = calibration
         self._expected_shots = expected_shots
         self._start_ns = time.time_ns() if start_ns is None else start_ns
+        self._schemas: dict[str, int] = {}
         self._lock = threading.Lock()
         self._check_disk(0)
         self._file = _ShotFile(self.path, overwrite, self.params.fsync_s)
@@ -144,7 +151,7 @@ class Recorder:
             self.closed = True
             try:
                 if not self._file.failed:
-                    self._writer.add_metadata(layout.END_METADATA, {"reason": reason, "shots": str(self.shots)})
+                    self._note(layout.END_METADATA, {"reason": reason, "shots": str(self.shots)})
                     self._writer.finish()
                     self._file.flush()
                     self._file.sync()
@@ -161,24 +168,24 @@ class Recorder:
     ) -> None:
         if error is None:
             self.close()
-        elif isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
-            self.close("interrupted")
-        else:
-            self.close(f"error: {error}")
+            return
+        stopped = isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit)
+        with suppress(RecordingError):  # what went wrong first is what the user must hear of
+            self.close("interrupted" if stopped else f"error: {error}")
 
     def _begin(self, source: str, rig_toml: str, plan: dict[str, object], metadata: dict[str, str]) -> None:
         from mcap.writer import CompressionType, Writer
 
         p = self.params
         library = f"scanmap {scanmap.__version__}"
-        about = {"scanmap_version": scanmap.__version__, "source": source, "start_ns": str(self._start_ns)}
+        about = _versions() | {"source": source, "start_ns": str(self._start_ns)}
         if plan:
             about["plan"] = json.dumps(plan)
         # A chunk ends where a shot ends, never by size.
         self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.NONE)
         try:
             self._writer.start(profile="ros2", library=library)
-            self._writer.add_metadata(layout.START_METADATA, metadata | about)
+            self._note(layout.START_METADATA, metadata | about)
             self._attach(layout.CALIBRATION_ATTACHMENT, self._calibration.dumps())
             if rig_toml:
                 self._attach(layout.RIG_ATTACHMENT, rig_toml)
@@ -196,12 +203,19 @@ class Recorder:
         transforms = messages.static_transforms(self._start_ns, self._calibration, p.joint)
         self._write_chunk(self._start_ns, [(layout.TF_STATIC_TOPIC, transforms)], 0)
 
+    def _note(self, name: str, data: dict[str, str]) -> None:
+        self._writer.add_metadata(name, data | {layout.METADATA_CRC: layout.metadata_crc(data)})
+
     def _attach(self, name: str, text: str) -> None:
         self._writer.add_attachment(self._start_ns, self._start_ns, name, "application/toml", text.encode())
 
     def _channel(self, topic: str, message_type: str, qos: str = "") -> int:
-        schema = self._writer.register_schema(message_type, "ros2msg", messages.definition(message_type))
-        return int(self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos}))
+        if message_type not in self._schemas:
+            text = messages.definition(message_type)
+            self._schemas[message_type] = int(self._writer.register_schema(message_type, "ros2msg", text))
+        return int(
+            self._writer.register_channel(topic, "cdr", self._schemas[message_type], {"offered_qos_profiles": qos})
+        )
 
     def _write_chunk(self, stamp: int, parts: list[tuple[str, bytes]], sequence: int) -> None:
         with self._lock:
@@ -233,6 +247,17 @@ class Recorder:
             f"recording {self.path} stopped after {self.shots} shots: {error.strerror or error}; they are readable: "
             f"scanmap replay {self.path}"
         )
+
+
+def _versions() -> dict[str, str]:
+    """Of what makes a point out of a picture."""
+    return {
+        "scanmap_version": scanmap.__version__,
+        "python_version": platform.python_version(),
+        "numpy_version": np.__version__,
+        "opencv_version": cv2.__version__,
+        "simplejpeg_version": version("simplejpeg"),
+    }
 
 
 class _ShotFile:

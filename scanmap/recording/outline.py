@@ -119,10 +119,14 @@ def _note(found: Outline, file: BinaryIO, record: Record) -> None:
             found.add(message.channel_id, np.array([message.log_time], np.uint64))
         elif record.opcode == mcap_records.METADATA:
             metadata = mcap_records.parse(records.Metadata.read, mcap_records.body(file, record))
-            found.metadata[metadata.name] = dict(metadata.metadata)
+            content = dict(metadata.metadata)
+            crc = content.pop(layout.METADATA_CRC, "")
+            if crc and crc != layout.metadata_crc(content):
+                raise DamagedError(f"metadata {metadata.name!r}: its CRC does not match")
+            found.metadata[metadata.name] = content
         elif record.opcode == mcap_records.ATTACHMENT and record.length < ATTACHMENT_LIMIT_BYTES:
-            name, content = mcap_records.attachment(mcap_records.body(file, record))
+            name, text = mcap_records.attachment(mcap_records.body(file, record))
             if name in (layout.CALIBRATION_ATTACHMENT, layout.RIG_ATTACHMENT):
-                found.attachments[name] = content.decode("utf-8")
+                found.attachments[name] = text.decode("utf-8")
     except (DamagedError, UnicodeDecodeError) as error:
         found.faults.append(f"{found.path}: the record at byte {record.offset} is damaged and left out: {error}")

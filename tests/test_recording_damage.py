@@ -1,0 +1,141 @@
+"""Cuts and flipped bytes: everything before is read, nothing is ever read wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded_shots import made_up_shots, record
+
+from scanmap.errors import CalibrationError, RecordingError
+from scanmap.recording import describe, open_source
+from scanmap.recording.mcap_records import CHUNK, Record, open_mcap, walk
+from scanmap.shot import Shot
+
+
+def chunk_ends(path: Path) -> list[int]:
+    """Bytes at which the chunks end; the first holds no shot."""
+    with open_mcap(path) as file:
+        return [r.offset + r.length for r in walk(file) if isinstance(r, Record) and r.opcode == CHUNK]
+
+
+def read(path: Path) -> tuple[list[Shot], list[str]]:
+    """Shots and faults of a damaged file; nothing at all where it says that there is nothing."""
+    try:
+        source = open_source(path)
+        return list(source.shots()), source.faults
+    except RecordingError as error:
+        return [], [str(error)]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_shot_before_a_cut_is_read(tmp_path: Path, seed: int) -> None:
+    shots = made_up_shots(8, off=True)
+    whole = record(tmp_path / "whole.mcap", shots)
+    data, ends = whole.read_bytes(), chunk_ends(whole)
+    cut = int(np.random.default_rng(seed).integers(0, len(data) - 40))
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[:cut])
+    before = sum(end <= cut for end in ends[1:])
+    got, faults = read(path)
+    assert got == shots[:before]
+    assert len(faults) == 1
+    if before:
+        assert f"{before} shots before the cut" in faults[0]
+        assert "is cut at byte" in faults[0]
+        info = describe(path)
+        assert info.shots == before
+        assert info.cut_at is not None
+        assert open_source(path).end_reason == "cut"
+        assert open_source(path).count == before
+        open_source(path).calibration()
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_flipped_byte_never_gives_a_wrong_image(tmp_path: Path, seed: int) -> None:
+    shots = made_up_shots(6, off=True, image_bytes=400)
+    path = record(tmp_path / "a.mcap", shots)
+    data = bytearray(path.read_bytes())
+    rng = np.random.default_rng(seed)
+    at = int(rng.integers(8, len(data)))
+    hit = sum(end <= at for end in chunk_ends(path)[1:])  # shots wholly before the damage
+    data[at] ^= int(rng.integers(1, 256))
+    path.write_bytes(data)
+    got, faults = read(path)
+    for shot in got:
+        assert shot.image in [s.image for s in shots]
+        original = next(s for s in shots if s.image == shot.image)
+        assert (shot.bearing, shot.background) == (original.bearing, original.background)
+        # without its metadata a file counts from its epoch, as those of others do
+        assert shot.time == original.time or "metadata" in faults[0] or shot.time > 1e9
+    assert len(got) >= len(shots) - 1
+    assert [s.image for s in shots[:hit]] == [s.image for s in got[:hit]]
+    if len(got) < len(shots):
+        assert faults
+
+
+def test_damage_costs_its_own_shot_and_is_reported(tmp_path: Path) -> None:
+    shots = made_up_shots(6)
+    path = record(tmp_path / "a.mcap", shots)
+    data = bytearray(path.read_bytes())
+    data[data.index(shots[2].image) + 1000] ^= 1
+    path.write_bytes(data)
+    told: list[str] = []
+    source = open_source(path)
+    assert [shot.index for shot in source.shots(on_fault=told.append)] == [0, 1, 3, 4, 5]
+    assert told == source.faults
+    assert "CRC" in told[0]
+    assert told[1] == "5 of 6 recorded shots could be read"
+    assert list(source.shots()) == [s for s in shots if s.index != 2]
+    assert len(source.faults) == 2
+
+
+@pytest.mark.parametrize("length", [0, 1, 5000, 1 << 20, 1 << 62])
+def test_a_wrong_length_is_stepped_over_by_the_index(tmp_path: Path, length: int) -> None:
+    shots = made_up_shots(6)
+    path = record(tmp_path / "a.mcap", shots)
+    with open_mcap(path) as file:
+        third = [r for r in walk(file) if isinstance(r, Record) and r.opcode == CHUNK][3]
+    data = bytearray(path.read_bytes())
+    data[third.offset - 8 : third.offset] = length.to_bytes(8, "little")
+    path.write_bytes(data)
+    got, faults = read(path)
+    assert got == [s for s in shots if s.index != 2]
+    assert "damaged" in faults[0]
+
+
+def test_a_damaged_calibration_is_not_used(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", made_up_shots(2))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"head_offset_m")
+    data[at + 17] ^= 1
+    path.write_bytes(data)
+    source = open_source(path)
+    assert not source.has_calibration
+    assert "CRC" in source.faults[0]
+    with pytest.raises(CalibrationError):
+        source.calibration()
+    assert len(list(source.shots())) == 2
+    assert "CRC" in source.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is empty"),
+        (b"solid cube", "is no MCAP file: it begins with b'solid cu'"),
+        (b"\x89MCAP0\r\n", "before its first shot"),
+    ],
+)
+def test_what_is_no_recording_is_told_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=message) as caught:
+        open_source(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_does_not_exist_names_what_can_be_replayed(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"does not exist.*\.mcap.*scan\.csv.*video"):
+        open_source(tmp_path / "nothing.mcap")
