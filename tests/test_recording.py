@@ -227,6 +227,15 @@ def test_a_full_disk_stops_the_scan_and_keeps_what_was_recorded(
     source = open_source(path)
     assert list(source.shots()) == shots[:5]
     assert source.end_reason == "cut"
+    assert describe(path).cut_at == path.stat().st_size  # no half chunk is left behind
+
+
+def test_times_between_nanoseconds_come_back_as_write_said(tmp_path: Path) -> None:
+    shot = Shot(0, 0.0, 0.0, 0.1234567894321, b"on")
+    with Recorder(tmp_path / "a.mcap", calibration=CALIBRATION, source="rig") as recorder:
+        kept = recorder.write(shot)
+    assert kept.time == 0.123456789
+    assert list(open_source(tmp_path / "a.mcap").shots()) == [kept]
 
 
 def test_free_disk_is_checked_before_and_during(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,6 +280,19 @@ def test_a_recording_without_a_calibration_says_how_to_give_one(tmp_path: Path) 
     assert not source.has_calibration
     with pytest.raises(CalibrationError, match="--calibration"):
         source.calibration()
+
+
+def test_a_description_in_words(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", made_up_shots(4, off=True), plan={"step_deg": 1.0})
+    lines = describe(path).lines
+    assert lines[0].startswith(f"recording {path}: 4 shots, 0.3 s, 0.0 MB")
+    assert "source: digital twin; its room is made up" in lines
+    assert "ended: finished" in lines
+    assert "carries: calibration" in lines
+    assert "plan step_deg: 1.0" in lines
+    assert "topic /camera/off/compressed: 4 sensor_msgs/msg/CompressedImage" in lines
+    path.write_bytes(path.read_bytes()[:-100])
+    assert any(line.startswith("ended: cut at byte") for line in describe(path).lines)
 
 
 def test_plans_of_others_are_shown_as_they_are(tmp_path: Path) -> None:

@@ -120,6 +120,15 @@ def test_a_damaged_calibration_is_not_used(tmp_path: Path) -> None:
     assert "CRC" in source.faults[0]
 
 
+def test_damaged_metadata_is_not_believed(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", made_up_shots(3))
+    path.write_bytes(path.read_bytes().replace(b"digital twin", b"digital tw1n", 1))
+    source = open_source(path)
+    assert source.metadata == {}
+    assert "metadata 'scanmap': its CRC does not match" in source.faults[0]
+    assert [s.image for s in source.shots()] == [s.image for s in made_up_shots(3)]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from scanmap.geometry import wrap_angle
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.messages import SECOND_NS, StampedImage, StampedJoints
 from scanmap.recording.source import Report
@@ -112,8 +111,8 @@ class Assembler:
         if before is None or after is None or after.stamp_ns - before.stamp_ns > self._gap_ns:
             return None
         part = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        turn = float(wrap_angle(after.reported - before.reported))
-        turn_commanded = float(wrap_angle(after.commanded - before.commanded))
+        turn = math.remainder(after.reported - before.reported, math.tau)
+        turn_commanded = math.remainder(after.commanded - before.commanded, math.tau)
         return _Bearing(stamp_ns, before.reported + part * turn, before.commanded + part * turn_commanded)
 
     def _miss(self, stamp_ns: int) -> None:

@@ -47,6 +47,29 @@ class RecordingInfo:
         """Whether the digital twin made it."""
         return self.source == layout.DIGITAL_TWIN
 
+    @property
+    def lines(self) -> list[str]:
+        """All of it in words, a line each."""
+        size = f", {self.duration_s:.1f} s, {self.size_bytes / 1e6:.1f} MB" if self.size_bytes else ""
+        carried = [name for name, there in (("calibration", self.has_calibration), ("rig", self.has_rig)) if there]
+        made_up = "; its room is made up" if self.is_twin else ""
+        lines = [
+            f"{self.kind} {self.path}: {self.shots} shots{size}",
+            f"source: {self.source or 'not noted'}{made_up}",
+            f"ended: {self._ended}",
+            f"carries: {', '.join(carried) or 'neither calibration nor rig; replay it with --calibration F'}",
+        ]
+        lines += [f"plan {key}: {value}" for key, value in self.plan.items()]
+        lines += [f"{key}: {value}" for key, value in self.versions.items()]
+        lines += [f"topic {name}: {topic.messages} {topic.message_type}" for name, topic in self.topics.items()]
+        return lines + [f"fault noted by the {fault.part}: {fault.message}" for fault in self.faults]
+
+    @property
+    def _ended(self) -> str:
+        if self.cut_at is not None:
+            return f"cut at byte {self.cut_at}; what stands before can be replayed"
+        return self.end_reason or "not noted"
+
 
 def describe(path: Path | str, params: RecordingParams | None = None) -> RecordingInfo:
     """Look into a recording, whole or cut; images are not read.

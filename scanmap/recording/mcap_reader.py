@@ -103,7 +103,7 @@ def _read(outlines: list[Outline], params: RecordingParams, report: Report) -> I
 
 def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message]]:
     """Every message of a file in its order, with its channel; what is broken goes to `report`."""
-    path, directory = found.path, found.directory
+    path, directory, nameless = found.path, found.directory, 0
     with mcap_records.open_mcap(path) as file:
         for record in mcap_records.walk(file):
             if isinstance(record, Break):
@@ -113,8 +113,12 @@ def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tupl
                     for message in _messages(record, mcap_records.body(file, record), directory):
                         if message.channel_id in directory.channels:
                             yield directory.channels[message.channel_id], message
+                        else:
+                            nameless += 1
                 except DamagedError as error:
                     report(f"{path}: the record at byte {record.offset} is damaged and left out: {error}")
+    if nameless:
+        report(f"{path}: {nameless} messages left out: the record that names their topic is damaged")
 
 
 def _messages(record: Record, data: bytes, directory: Directory) -> Iterator[Message]:

@@ -114,7 +114,8 @@ def walk(file: BinaryIO) -> Iterator[Record | Break]:
     """
     size = os.fstat(file.fileno()).st_size
     whole = _ends_with_magic(file, size)
-    marks = _chunk_starts(file, size) if whole else []
+    summary = _summary(file, size) if whole else b""
+    marks = _chunk_starts(summary, size)
     offset = len(MAGIC)
     while True:
         file.seek(offset)
@@ -133,6 +134,9 @@ def walk(file: BinaryIO) -> Iterator[Record | Break]:
         if opcode == FOOTER:
             return
         offset = end
+        if opcode == DATA_END and summary is None:
+            yield Break(offset, cut=False, resumed_at=None)
+            return
 
 
 def body(file: BinaryIO, record: Record) -> bytes:
@@ -232,15 +236,28 @@ def _ends_with_magic(file: BinaryIO, size: int) -> bool:
     return file.read(len(MAGIC)) == MAGIC
 
 
-def _chunk_starts(file: BinaryIO, size: int) -> list[int]:
-    """Where the chunks begin, and last the index itself, by the index at the end of the file; ascending."""
+def _summary(file: BinaryIO, size: int) -> bytes | None:
+    """The records between data and footer: schemas, channels, indexes; empty if there are none, None if damaged."""
     footer = size - len(MAGIC) - FOOTER_BYTES
     file.seek(footer)
-    (position,) = struct.unpack("<Q", file.read(8))
+    fields = file.read(FOOTER_BYTES)
+    position, _, crc = struct.unpack("<QQI", fields)
+    if position == 0:
+        return b""
     if not len(MAGIC) < position < footer or footer - position > LARGEST_RECORD:
-        return []
+        return None
     file.seek(position)
-    summary = file.read(footer - HEADER_BYTES - position)
+    summary = file.read(footer - position)  # with the footer's own opcode and length, as the CRC has it
+    if crc not in (0, zlib.crc32(fields[:-4], zlib.crc32(summary))):
+        return None
+    return summary[:-HEADER_BYTES]
+
+
+def _chunk_starts(summary: bytes | None, size: int) -> list[int]:
+    """Where the chunks begin, and last the summary itself; ascending, empty if unknown."""
+    if not summary:
+        return []
+    position = size - len(MAGIC) - FOOTER_BYTES - HEADER_BYTES - len(summary)
     at, starts = 0, [position]
     while at + HEADER_BYTES <= len(summary):
         opcode, length = struct.unpack_from("<BQ", summary, at)

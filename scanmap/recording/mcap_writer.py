@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shutil
 import threading
@@ -14,7 +13,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from scanmap.errors import RecordingError
 from scanmap.recording import layout, messages
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.messages import SECOND_NS, Fault
+from scanmap.recording.shot_file import ShotFile
 from scanmap.shot import Shot
 
 LEVELS = {"ok": 0, "warning": 1, "error": 2}
@@ -87,7 +87,7 @@ class Recorder:
         self._schemas: dict[str, int] = {}
         self._lock = threading.Lock()
         self._check_disk(0)
-        self._file = _ShotFile(self.path, overwrite, self.params.fsync_s)
+        self._file = ShotFile(self.path, overwrite, self.params.fsync_s)
         self._begin(source, rig_toml, dict(plan or {}), dict(metadata or {}))
 
     @property
@@ -258,58 +258,3 @@ def _versions() -> dict[str, str]:
         "opencv_version": cv2.__version__,
         "simplejpeg_version": version("simplejpeg"),
     }
-
-
-class _ShotFile:
-    """The stream under the MCAP writer: keeps what belongs to a chunk together, never leaves half of one.
-
-    A plain buffered file would keep the rest of a chunk after a full disk, and fail on it again at close.
-    """
-
-    def __init__(self, path: Path, overwrite: bool, fsync_s: float) -> None:
-        self.failed = False
-        self._fsync_s = fsync_s
-        self._parts: list[bytes] = []
-        self._length = 0  # bytes on file and in _parts
-        self._safe = 0  # bytes on file that end with a whole record
-        self._synced = time.monotonic()
-        try:
-            self._raw: Any = path.open("wb" if overwrite else "xb", buffering=0)
-        except FileExistsError as error:
-            raise RecordingError(
-                f"recording {path} exists already; choose another name (--record F.mcap) or move it away"
-            ) from error
-        except OSError as error:
-            raise RecordingError(f"recording {path} cannot be written: {error.strerror}") from error
-
-    def write(self, data: bytes) -> int:
-        self._parts.append(data)
-        self._length += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._length
-
-    def flush(self) -> None:
-        """Hand everything to the operating system; on failure cut the file back to its last whole chunk."""
-        data = memoryview(b"".join(self._parts))
-        self._parts.clear()
-        try:
-            while data:
-                data = data[self._raw.write(data) :]
-        except OSError:
-            self.failed = True
-            self._raw.truncate(self._safe)
-            raise
-        self._safe = self._length
-
-    def sync_when_due(self) -> None:
-        if time.monotonic() - self._synced >= self._fsync_s:
-            self.sync()
-
-    def sync(self) -> None:
-        os.fsync(self._raw.fileno())
-        self._synced = time.monotonic()
-
-    def close(self) -> None:
-        self._raw.close()
