@@ -42,8 +42,8 @@ def load_open3d() -> Any:
 class Hits(NamedTuple):
     """What N rays met first."""
 
-    distance: F64  # (N,) in lengths of the direction, inf where nothing was met
-    triangle: NDArray[np.int64]  # (N,) index, -1 where nothing was met
+    distance: NDArray[np.floating]  # (N,) in lengths of the direction, inf where nothing was met
+    triangle: NDArray[np.int32]  # (N,) index, -1 where nothing was met
     uv: F32  # (N, 2) barycentric: p = (1 - u - v) a + u b + v c
 
 
@@ -80,15 +80,16 @@ class RayScene:
         Args:
             origins: (3,) or (N, 3) [m].
             directions: (N, 3), any length.
-            exact: distances to double precision, for measuring rather than for looking.
+            exact: distances in float64, for measuring; float32 is enough for looking.
         """
         rays = _rays(origins, directions)
         # One thread: a second one halves the wait and doubles the CPU time, which the decoders need.
         found = self._scene.cast_rays(self._tensor(rays), nthreads=1)
-        distance = found["t_hit"].numpy().astype(np.float64)
-        triangle = found["primitive_ids"].numpy().astype(np.int64)
-        triangle[~np.isfinite(distance)] = -1
+        distance = found["t_hit"].numpy()
+        # Embree's number for nothing is the largest uint32: -1 once it is signed.
+        triangle = found["primitive_ids"].numpy().view(np.int32)
         if exact:
+            distance = distance.astype(np.float64)
             met = np.flatnonzero(triangle >= 0)
             normal = self.normals[triangle[met]]
             start = np.broadcast_to(np.asarray(origins, np.float64), rays[:, :3].shape)[met]

@@ -45,7 +45,11 @@ def _shell(rng: np.random.Generator) -> list[Part]:
         ]
     )
     floor = Material((0.42, 0.27, 0.16), texture=boards(rng, (0.0, 0.0, 0.0), 1.9, 1.04))
-    skirting = [([LENGTH / 2, 0.006, 0.035], [LENGTH, 0.012, 0.07]), ([0.006, WIDTH / 2, 0.035], [0.012, WIDTH, 0.07])]
+    thick, high = 0.012, 0.07
+    skirting = [
+        quad([0, thick, 0], [0, 0, high], [LENGTH, 0, 0]), quad([0, 0, high], [LENGTH, 0, 0], [0, thick, 0]),
+        quad([thick, 0, 0], [0, WIDTH, 0], [0, 0, high]), quad([0, 0, high], [thick, 0, 0], [0, WIDTH, 0]),
+    ]  # fmt: skip
     return [
         (Thing("floor", floor), quad([0, 0, 0], [LENGTH, 0, 0], [0, WIDTH, 0])),
         (Thing("ceiling", Material((0.84, 0.84, 0.82))), quad([0, 0, HEIGHT], [0, WIDTH, 0], [LENGTH, 0, 0])),
@@ -53,7 +57,7 @@ def _shell(rng: np.random.Generator) -> list[Part]:
         (Thing("wall_north", white), north),
         (Thing("wall_west", accent), quad([0, 0, 0], [0, WIDTH, 0], [0, 0, HEIGHT])),
         (Thing("wall_east", white), quad([LENGTH, 0, 0], [0, 0, HEIGHT], [0, WIDTH, 0])),
-        (Thing("skirting", Material((0.70, 0.69, 0.66))), merged([box(c, s) for c, s in skirting])),
+        (Thing("skirting", Material((0.70, 0.69, 0.66))), merged(skirting)),
     ]
 
 

@@ -101,7 +101,7 @@ class LaserFan:
         hits = self._scene.rays.cast(transform(T_world_head, self.source), self._directions @ R.T, exact=True)
         met = np.flatnonzero(hits.triangle >= 0)
         hits = Hits(hits.distance[met], hits.triangle[met], hits.uv[met])
-        direction, distance = self._directions[met], hits.distance
+        direction, distance = self._directions[met], hits.distance.astype(np.float64)
         points = self.source + distance[:, None] * direction
         world = transform(T_world_head, points)
         normal = self._scene.rays.normals[hits.triangle] @ R

@@ -44,19 +44,20 @@ class Scene:
         self._albedo = np.array([m.albedo for m in materials], np.float32)
         self.gloss = np.array([m.gloss for m in materials], np.float32)
         self._emission = np.array([m.emission for m in materials], np.float32)
+        self._shining, self._mirrors = bool(self._emission.any()), self.gloss > 0
         self._textures = [(k, m.texture) for k, m in enumerate(materials) if m.texture is not None]
-        self._vertex_albedo = None if room.vertex_albedo is None else room.vertex_albedo.astype(np.float32)
-        self._light = bake(room, self.rays, light, self._albedo_of_corners())
+        self._file_albedo = None if room.vertex_albedo is None else _spread(room.vertex_albedo, room)
+        self._light = _spread(bake(room, self.rays, light, self._albedo_of_corners()), room)
 
     def radiance(self, origin: F64, directions: F32) -> F32:
-        """RGB radiance (N, 3) [fraction of saturation] seen from `origin` (3,) along `directions` (N, 3)."""
+        """RGB radiance (N, 3) [fraction of saturation] seen from `origin` (3,) or (N, 3) along `directions` (N, 3)."""
         return self._seen(origin, directions, mirrored=True)
 
-    def albedo(self, hits: Hits, points: F64) -> F32:
+    def albedo(self, hits: Hits, points: NDArray[np.floating]) -> F32:
         """Diffuse reflectance (N, 3) RGB where rays met the room at world `points` (N, 3)."""
         thing = self._thing_of[hits.triangle]
-        known = self._vertex_albedo
-        albedo = self._albedo[thing] if known is None else self._interpolated(known, hits)
+        known = self._file_albedo
+        albedo = self._albedo[thing] if known is None else _interpolated(known, hits)
         for k, texture in self._textures:
             on = np.flatnonzero(thing == k)
             if len(on):
@@ -65,39 +66,42 @@ class Scene:
 
     def _seen(self, origin: F64, directions: F32, *, mirrored: bool) -> F32:
         hits = self.rays.cast(origin, directions)
-        seen = np.zeros((len(directions), 3), np.float32)
-        met = np.flatnonzero(hits.triangle >= 0)
-        hits = Hits(hits.distance[met], hits.triangle[met], hits.uv[met])
-        way = directions[met]
-        start = origin if np.ndim(origin) == 1 else origin[met]
-        points = start + hits.distance[:, None] * way
+        missed = hits.triangle < 0
+        # Rays that met nothing are shaded as if on triangle -1, and blackened in the end.
+        points = np.where(missed, 0, hits.distance)[:, None].astype(np.float32) * directions + origin.astype(np.float32)
         thing = self._thing_of[hits.triangle]
-        light = self.albedo(hits, points) * self._interpolated(self._light, hits) + self._emission[thing]
-        glossy = np.flatnonzero(self.gloss[thing] > 0) if mirrored else np.empty(0, np.intp)
+        light = self.albedo(hits, points) * _interpolated(self._light, hits)
+        if self._shining:
+            light += self._emission[thing]
+        glossy = np.flatnonzero(self._mirrors[thing] & ~missed) if mirrored else np.empty(0, np.intp)
         if len(glossy):
-            normal = self.rays.normals[hits.triangle[glossy]]
-            onward = way[glossy] - 2.0 * np.einsum("ij,ij->i", way[glossy], normal)[:, None] * normal
-            onward = onward.astype(np.float32)
+            way, normal = directions[glossy], self.rays.normals[hits.triangle[glossy]].astype(np.float32)
+            onward = way - 2.0 * np.einsum("ij,ij->i", way, normal)[:, None] * normal
             reflection = self._seen(points[glossy] + 1e-4 * onward, onward, mirrored=False)
             light[glossy] += self.gloss[thing[glossy], None] * reflection
-        seen[met] = light
-        return seen
-
-    def _interpolated(self, per_vertex: F32, hits: Hits) -> F32:
-        corner = self.rays.triangles[hits.triangle]
-        u, v = hits.uv[:, :1], hits.uv[:, 1:]
-        mixed: F32 = (
-            (1.0 - u - v) * per_vertex[corner[:, 0]] + u * per_vertex[corner[:, 1]] + v * per_vertex[corner[:, 2]]
-        )
-        return mixed
+        light[missed] = 0.0
+        return light
 
     def _albedo_of_corners(self) -> F64:
         """Mean reflectance (V, 3) around each corner, textures left aside."""
-        if self._vertex_albedo is not None:
-            return self._vertex_albedo.astype(np.float64)
+        if self.room.vertex_albedo is not None:
+            return self.room.vertex_albedo
         albedo = np.zeros((len(self.room.vertices), 3))
         albedo[self.room.triangles.ravel()] = np.repeat(self._albedo[self._thing_of], 3, axis=0)
         return albedo
+
+
+def _spread(per_vertex: NDArray[np.floating], room: Room) -> F32:
+    """Per triangle (M, 3, 3) what `_interpolated` needs: the value at corner a, and the steps to b and to c."""
+    a, b, c = (per_vertex[room.triangles[:, k]] for k in range(3))
+    return np.stack([a, b - a, c - a], axis=1).astype(np.float32)
+
+
+def _interpolated(spread: F32, hits: Hits) -> F32:
+    """Values (N, 3) at hits, by barycentric coordinates."""
+    own = spread[hits.triangle]
+    value: F32 = own[:, 0] + hits.uv[:, :1] * own[:, 1] + hits.uv[:, 1:] * own[:, 2]
+    return value
 
 
 def build_scene(params: RoomParams, light: LightParams | None = None) -> Scene:

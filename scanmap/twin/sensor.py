@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
@@ -76,8 +77,8 @@ class Sensor:
 
     def noise_amplitude(self, coded: Coded) -> NDArray[np.uint8]:
         """Noise of coded values, standard deviation in 16ths of a grey level."""
-        amplitude: NDArray[np.uint8] = self._sigma[np.minimum(coded >> 6, 255)]
-        return amplitude
+        level = cv2.convertScaleAbs(coded, alpha=1.0 / STEPS)
+        return np.asarray(cv2.LUT(level, self._sigma), np.uint8)
 
     def read_out(self, coded: Coded, amplitude: NDArray[np.uint8]) -> bytes:
         """One picture (H, W, 3) RGB with its noise, encoded."""

@@ -22,13 +22,14 @@ class Texture:
     across: tuple[float, float, float]  # one raster width, as direction / length [1/m]
     down: tuple[float, float, float]  # one raster height, as direction / length [1/m]
 
-    def at(self, points: F64) -> F32:
+    def at(self, points: NDArray[np.floating]) -> F32:
         """RGB factors (N, 3) at world points (N, 3)."""
         h, w = self.raster.shape[:2]
-        offset = points - np.asarray(self.origin)
-        column = np.floor(np.mod(offset @ np.asarray(self.across), 1.0) * w).astype(np.intp)
-        row = np.floor(np.mod(offset @ np.asarray(self.down), 1.0) * h).astype(np.intp)
-        sampled: F32 = self.raster[np.minimum(row, h - 1), np.minimum(column, w - 1)]
+        axes = np.stack([np.asarray(self.across) * w, np.asarray(self.down) * h], axis=1)
+        cell = np.einsum("ij,jk->ki", points, axes.astype(points.dtype))
+        cell -= (np.asarray(self.origin) @ axes).astype(points.dtype)[:, None]
+        column, row = np.floor(cell).astype(np.int32)
+        sampled: F32 = self.raster.reshape(-1, 3)[(row % h) * w + column % w]
         return sampled
 
     def moved(self, T: F64) -> Texture:
