@@ -72,8 +72,8 @@ class GrblStage:
         target = math.degrees(bearing)
         check_limits(target, self._params)
         if self._params.backlash_deg:
-            here = self._where_deg()
-            if target < here or not self._from_below:
+            way = target - self._where_deg()
+            if way < 0 or (not self._from_below and way < self._params.backlash_deg):
                 self._go(target - self._params.backlash_deg)
             self._from_below = True
         return math.radians(self._go(target))
@@ -107,9 +107,8 @@ class GrblStage:
         self._link.fault = None
         for line in self._link.preamble:
             self._link.command(line)
-        if self._params.homing == "index":
-            self._find_index()
-        self._zero_deg = self._machine_deg(self._status())
+        by_index = self._params.homing == "index"
+        self._zero_deg = self._find_index() if by_index else self._machine_deg(self._status())
         self._from_below = False
         return self.where()
 
@@ -190,20 +189,26 @@ class GrblStage:
         return found[0][1] if found else None
 
     def _unlock(self) -> None:
-        self._link.command("$X", despite_fault=True)
-        if self._status().state == "Alarm":
-            self._link.reset()
+        for attempt in range(2):
             self._link.command("$X", despite_fault=True)
-        if self._status().state == "Alarm":
+            if self._status().state != "Alarm":
+                break
+            if attempt == 0:
+                self._link.reset()
+        else:
             raise StageError(self._link.fault or f"stage {self._link.name} stays in alarm: check its limit switches")
         self._link.fault = None
 
-    def _find_index(self) -> None:
-        """Turn toward smaller bearings until the probe input sees the mark; the board's zero moves there."""
-        travel = self._params.max_deg - self._params.min_deg
+    def _find_index(self) -> float:
+        """Turn toward smaller bearings until the probe input sees the mark; the board's X of the mark."""
+        travel = self._params.direction * (self._params.max_deg - self._params.min_deg)
         feed = self._params.speed_deg_s * 60 / 4
-        x = self._machine_deg(self._status()) - self._params.direction * travel
-        self._link.command(f"G53 G38.2 X{x:.3f} F{feed:.1f}", silence_s=HOMING_S)
+        answers = self._link.command(f"G91 G38.2 X{-travel:.3f} F{feed:.1f}", silence_s=HOMING_S)
+        self._link.command("G90")
+        found = next(filter(None, map(protocol.parse_probe, answers)), None)
+        if found is None:
+            raise StageError(f"stage {self._link.name} did not say where the index mark is: check the probe input")
+        return found
 
     def _go(self, target_deg: float) -> float:
         """Move, prove the arrival, and return the bearing reported [deg]."""

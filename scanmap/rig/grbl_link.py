@@ -15,7 +15,7 @@ from scanmap.rig import grbl_protocol as protocol
 from scanmap.rig.grbl_protocol import Banner, Status
 from scanmap.rig.serial_port import SerialPort
 
-POLL_S = 0.25  # `?` while waiting; grbl wants no more than 5 to 10 a second
+POLL_S = 0.25  # `?` while waiting, or more often for a short time-out; grbl wants no more than 5 to 10 a second
 ATTEMPTS = 3
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
 
@@ -28,6 +28,7 @@ class GrblLink:
     def __init__(self, port: SerialPort, timeout_s: float) -> None:
         self._port = port
         self._timeout_s = timeout_s
+        self._poll_s = min(POLL_S, timeout_s / 4)
         self._answered = True  # False while a line is out; stays so if the caller was interrupted
         self.preamble: list[str] = []  # sent after every reset that was asked for
         self.fault: str | None = None  # why commands are refused: position lost, alarm
@@ -79,7 +80,7 @@ class GrblLink:
         while time.monotonic() < deadline:
             self._port.write(protocol.STATUS)
             asked = time.monotonic()
-            while (line := self._port.read_line(max(0.0, asked + POLL_S - time.monotonic()))) is not None:
+            while (line := self._port.read_line(max(0.0, asked + self._poll_s - time.monotonic()))) is not None:
                 if (status := self._note(line)) is not None:
                     return status
         raise StageError(self._silence())
@@ -134,10 +135,10 @@ class GrblLink:
 
     def _await_answer(self, silence_s: float, despite_fault: bool) -> tuple[str, list[str]]:
         """`ok`, an error in words, or `""` where the board is idle and the answer got lost."""
-        wait = _Wait(silence_s)
+        wait = _Wait(silence_s, self._poll_s)
         information: list[str] = []
         while True:
-            line = self._port.read_line(POLL_S)
+            line = self._port.read_line(self._poll_s)
             if line == "ok":
                 return "ok", information
             code = protocol.parse_code(line) if line else None
@@ -181,8 +182,9 @@ class GrblLink:
 class _Wait:
     """How long to wait for an answer: as long as the board is alive and busy."""
 
-    def __init__(self, silence_s: float) -> None:
+    def __init__(self, silence_s: float, poll_s: float) -> None:
         now = time.monotonic()
+        self._poll_s = poll_s
         self._silence_s = silence_s
         self._heard = self._polled = self._moved = now
         self._position: tuple[float, ...] | None = None
@@ -194,7 +196,7 @@ class _Wait:
 
     def poll_due(self) -> bool:
         now = time.monotonic()
-        if now - self._polled < POLL_S:
+        if now - self._polled < self._poll_s:
             return False
         self._polled = now
         return True

@@ -152,6 +152,13 @@ def parse_setting(line: str) -> tuple[str, float] | None:
     return (match["name"], float(match["value"])) if match else None
 
 
+def parse_probe(line: str) -> float | None:
+    """X where the probe input closed, `[PRB:-12.500,0.000,0.000:1]`; None for one that did not close."""
+    place, _, closed = line.removeprefix("[PRB:").partition(":")
+    values = _numbers(place)
+    return values[0] if values and line.startswith("[PRB:") and closed == "1]" else None
+
+
 def explain(kind: str, code: int) -> str:
     """An error or alarm in words, with what to do."""
     words = (ERRORS if kind == "error" else ALARMS).get(code, "see the firmware's list of codes")

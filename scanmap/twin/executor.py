@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Wait = Generator[float, None, None]
 Answer = Generator[float, None, int]  # grbl's error number, 0 for ok
 
+MARK_DEG = 0.2  # half the width of the index mark
 _SEARCH = 1.5  # homing looks as far as this times $130
 
 
@@ -298,6 +299,9 @@ class Executor:
         """Turn toward `target` until the index mark is seen."""
         board = self._board
         start = board.planner.position()
+        if board.index_deg is not None and abs(board.index_deg - board.drivetrain.bearing_deg) < MARK_DEG:
+            board.raise_alarm(4)
+            return
         mark = None if board.index_deg is None else start[0] + board.index_deg - board.drivetrain.bearing_deg
         found = mark is not None and min(start[0], target[0]) <= mark <= max(start[0], target[0])
         self._plan(np.array([mark, *start[1:]]) if found else target, feed, is_jog=False)

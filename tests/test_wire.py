@@ -1,0 +1,296 @@
+"""The GRBL driver byte by byte: scripted (sent, reply) pairs for three firmwares; nothing may remain."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from scanmap.errors import ConfigError, StageError
+from scanmap.rig.grbl import GrblStage
+from scanmap.rig.grbl_link import GrblLink
+from scanmap.rig.grbl_protocol import Dialect, dialect_of_build_info
+from scanmap.rig.manual import ManualStage
+from scanmap.rig.serial_port import SerialPort
+from scanmap.rig.stage import StageParams
+from scanmap.rig.template import TemplateStage
+
+Script = list[tuple[bytes, bytes]]
+
+
+class ScriptedPort:
+    """Stands for a pyserial port: what is sent must be the next of the script, whose reply then arrives."""
+
+    def __init__(self, script: Script) -> None:
+        self.script = list(script)
+        self.incoming = bytearray()
+        self.closed = False
+        self.deaf_to_status = False
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self.incoming)
+
+    def write(self, data: bytes) -> int:
+        if self.deaf_to_status and data == b"?":
+            return 1
+        assert self.script, f"{data!r} was sent, the script is at its end"
+        expected, reply = self.script.pop(0)
+        assert data == expected
+        self.incoming += reply
+        return len(data)
+
+    def read(self, size: int) -> bytes:
+        chunk = bytes(self.incoming[:size])
+        del self.incoming[:size]
+        return chunk
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def at(x: float, state: str = "Idle") -> bytes:
+    return f"<{state}|MPos:{x:.3f},0.000,0.000|FS:0,0>\r\n".encode()
+
+
+OK = b"ok\r\n"
+PREAMBLE = (b"G21 G90 G94 G1 F1200.0\n", OK)
+OPEN_GRBL: Script = [
+    (b"?", at(0)),
+    (b"$$\n", b"$1=25\r\n$10=1\r\n$13=0\r\n$32=1\r\n$100=250.000\r\n$110=500.000\r\n$120=10.000\r\nok\r\n"),
+    (b"$100=80\n", OK),
+    (b"$1=255\n", OK),
+    (b"$110=1200\n", OK),
+    (b"$32=0\n", OK),
+    PREAMBLE,
+    (b"M5\n", OK),
+]
+CLOSE_GRBL: Script = [(b"M5\n", OK), (b"$1=25\n", OK), (b"\x18", b"\r\nGrbl 1.1h ['$' for help]\r\n")]
+OPEN_HAL: Script = [
+    (b"?", b"<Alarm|MPos:0.000,0.000,0.000|Bf:35,1023|FS:0,0|Pn:X>\r\n"),
+    (b"$X\n", b"[MSG:Caution: Unlocked]\r\nok\r\n"),
+    (b"?", at(0)),
+    (b"$$\n", b"$1=255\r\n$32=0\r\n$100=80.000\r\n$110=6000.000\r\n$120=100.000\r\n$481=0\r\n$650=text\r\nok\r\n"),
+    PREAMBLE,
+    (b"M5\n", OK),
+]
+OPEN_FLUIDNC: Script = [
+    (b"?", at(0)),
+    (b"$/axes/x/steps_per_mm\n", b"$/axes/x/steps_per_mm=80.000\r\nok\r\n"),
+    (b"$/stepping/idle_ms\n", b"$/stepping/idle_ms=255\r\nok\r\n"),
+    PREAMBLE,
+    (b"M5\n", OK),
+]
+CLOSE_FLUIDNC: Script = [
+    (b"M5\n", OK),
+    (b"$MD\n", OK),
+    (b"\x18", b"\r\nGrbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]\r\n"),
+]
+
+
+def move(x: float, reported: float | None = None) -> Script:
+    return [
+        (f"G53 G1 X{x:.4f} F1200.0\n".encode(), OK),
+        (b"G4 P0.01\n", OK),
+        (b"?", at(x if reported is None else reported)),
+    ]
+
+
+def play(script: Script, dialect: Dialect = Dialect.GRBL, **params: object) -> tuple[GrblStage, ScriptedPort]:
+    port = ScriptedPort(script)
+    settings = StageParams.model_validate({"steps_per_deg": 80.0, "timeout_s": 0.2, **params})
+    return GrblStage(GrblLink(SerialPort(port, "script"), settings.timeout_s), dialect, settings), port
+
+
+def finish(port: ScriptedPort) -> None:
+    assert port.script == []
+    assert port.incoming == b""
+
+
+@pytest.mark.parametrize(
+    ("dialect", "opening", "closing"),
+    [
+        (Dialect.GRBL, OPEN_GRBL, CLOSE_GRBL),
+        (Dialect.GRBLHAL, OPEN_HAL, CLOSE_GRBL),
+        (Dialect.FLUIDNC, OPEN_FLUIDNC, CLOSE_FLUIDNC),
+    ],
+)
+def test_open_move_laser_close(dialect: Dialect, opening: Script, closing: Script) -> None:
+    middle = [*move(90.0, 89.988), (b"M3 S1000\n", OK), (b"M5\n", OK)]
+    stage, port = play([*opening, *middle, *closing], dialect)
+    assert stage.move_to(math.pi / 2) == math.radians(89.9875)  # the whole step that 89.988 stands for
+    stage.laser(True)
+    stage.laser(False)
+    stage.close()
+    stage.close()
+    assert port.closed
+    finish(port)
+
+
+def test_always_on_laser_is_never_switched_nor_its_mode_touched() -> None:
+    opening = [pair for pair in OPEN_GRBL if pair[0] not in (b"M5\n", b"$32=0\n")]
+    stage, port = play([*opening, *CLOSE_GRBL[1:]], laser="always-on")
+    assert not stage.laser_switchable
+    stage.laser(True)
+    stage.laser(False)
+    stage.close()
+    finish(port)
+
+
+def test_backlash_is_taken_up_from_below() -> None:
+    up = [(b"?", at(0)), *move(-0.5), *move(0), (b"?", at(0)), *move(10)]
+    further = [(b"?", at(10)), *move(20)]
+    down = [(b"?", at(20)), *move(14.5), *move(15)]
+    stage, port = play([*OPEN_GRBL, *up, *further, *down], backlash_deg=0.5)
+    for deg in (0, 10, 20, 15):
+        stage.move_to(math.radians(deg))
+    finish(port)
+
+
+def test_direction_and_home_bearing_turn_the_axis_round() -> None:
+    stage, port = play([*OPEN_GRBL, *move(-80.0)], direction=-1, home_deg=10.0)
+    assert stage.move_to(math.pi / 2) == pytest.approx(math.pi / 2)
+    finish(port)
+
+
+def test_work_coordinates_and_inches_are_undone() -> None:
+    opening = [*OPEN_GRBL]
+    opening[0] = (b"?", b"<Idle|WPos:0.000,0.000,0.000|FS:0,0>\r\n")
+    opening[1] = (opening[1][0], opening[1][1].replace(b"$13=0", b"$13=1"))
+    report = b"<Idle|WPos:1.000,0.000,0.000|FS:0,0>\r\n"
+    offset = b"<Idle|WPos:1.000,0.000,0.000|FS:0,0|WCO:2.000,0.000,0.000>\r\n"
+    opening.insert(1, (b"?", offset))
+    stage, port = play([*opening, (b"?", report)])
+    assert stage.where() == pytest.approx(math.radians(76.2))
+    finish(port)
+
+
+def test_lost_ok_is_noticed_by_an_idle_board_and_the_line_sent_again() -> None:
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    stage, port = play([*OPEN_GRBL, (line, b""), (b"?", at(10)), (b"?", at(10)), *move(10)])
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_lost_status_is_asked_for_again() -> None:
+    stage, port = play([*OPEN_GRBL, (b"?", b""), (b"?", b"<Idle|MPos:garb\r\n" + at(3))], timeout_s=1.0)
+    assert stage.where() == pytest.approx(math.radians(3))
+    finish(port)
+
+
+def test_a_line_damaged_on_its_way_is_sent_again_and_a_wrong_place_is_noticed() -> None:
+    damaged = [(b"G53 G1 X10.0000 F1200.0\n", b"error:2\r\n"), *move(10, reported=1.0), *move(10)]
+    stage, port = play([*OPEN_GRBL, *damaged])
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_a_head_that_never_arrives_is_an_error_with_both_places() -> None:
+    stage, port = play([*OPEN_GRBL, *move(10, reported=4), *move(10, reported=4)])
+    with pytest.raises(StageError, match="asked for 10 deg and stands at 4"):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [
+        (b"ALARM:1\r\n[MSG:Reset to continue]\r\n", "ALARM:1, a limit switch was hit .*stage home"),
+        (b"\r\nGrbl 1.1h ['$' for help]\r\n", "restarted by itself.*power supply"),
+        (b"error:9\r\n", "error:9, the board is locked"),
+        (b"\x00\xff\xfe<<<>|ok?\r\n", "has not answered for 0.2 s"),
+    ],
+)
+def test_what_goes_wrong_is_said_in_words(reply: bytes, words: str) -> None:
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    again: Script = [(line, reply)] if reply.startswith(b"error") else []
+    stage, port = play([*OPEN_GRBL, (line, reply), *again])
+    port.deaf_to_status = True
+    with pytest.raises(StageError, match=words):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_outside_the_limits_nothing_is_sent() -> None:
+    stage, port = play(OPEN_GRBL)
+    for deg in (-0.1, 180.1, math.nan, math.inf):
+        with pytest.raises(StageError, match=r"outside 0 to 180.*stage\.max_deg"):
+            stage.move_to(math.radians(deg))
+    finish(port)
+
+
+def test_homing_by_switch_at_opening() -> None:
+    settled = [(b"$H\n", OK), PREAMBLE, (b"?", at(-1.0)), (b"?", at(-1.0)), (b"M5\n", OK)]
+    stage, port = play([*OPEN_GRBL[:-2], *settled, *move(88.0)], homing="switch", home_deg=1.0)
+    assert stage.move_to(math.pi / 2) == pytest.approx(math.pi / 2)
+    finish(port)
+
+
+def test_fluidnc_with_other_steps_in_its_file_is_refused() -> None:
+    with pytest.raises(StageError, match=r"steps_per_mm is 80 .*steps_per_deg is 44.*make them equal"):
+        play(OPEN_FLUIDNC[:2], Dialect.FLUIDNC, steps_per_deg=44.0)
+
+
+def test_build_info_beats_a_disguised_banner() -> None:
+    assert dialect_of_build_info(["[VER:1.1f:]", "[FIRMWARE:grblHAL]"], Dialect.GRBL) is Dialect.GRBLHAL
+    assert dialect_of_build_info(["[VER:1.1h.20190825:]"], Dialect.GRBL) is Dialect.GRBL
+
+
+def test_template_speaks_the_users_own_language() -> None:
+    script = [
+        (b"S90.0 1500\n", b"hm\r\ndone 1\r\n"),
+        (b"L1\n", b"done\r\n"),
+        (b"L0\n", b"done\r\n"),
+        (b"FREE\n", b"done\r\n"),
+    ]
+    params = StageParams(
+        kind="template",
+        command_move="S{deg:.1f} {us:.0f}",
+        command_laser_on="L1",
+        command_laser_off="L0",
+        command_release="FREE",
+        answer="done",
+        speed_deg_s=720,
+        timeout_s=0.2,
+    )
+    port = ScriptedPort(script)
+    stage = TemplateStage(SerialPort(port, "servo"), params)
+    assert stage.move_to(math.pi / 2) == stage.where() == math.pi / 2
+    stage.laser(True)
+    stage.close()
+    assert port.closed
+    finish(port)
+
+
+def test_template_faults() -> None:
+    with pytest.raises(ConfigError, match=r"command_move = 'S\{angle\}'.*\{deg\}"):
+        TemplateStage(SerialPort(ScriptedPort([]), "servo"), StageParams(kind="template", command_move="S{angle}"))
+    params = StageParams(kind="template", command_move="S{deg:g}", speed_deg_s=720, timeout_s=0.05)
+    stage = TemplateStage(SerialPort(ScriptedPort([(b"S9\n", b"what\r\n")]), "servo"), params)
+    with pytest.raises(StageError, match=r"did not answer 'ok' to 'S9' \(last heard: 'what'\)"):
+        stage.move_to(math.radians(9))
+
+
+def test_manual_asks_again_until_it_understands() -> None:
+    asked: list[str] = []
+    answers = iter(["", "abc", "400", "12.5"])
+
+    def ask(question: str) -> str:
+        asked.append(question)
+        return next(answers)
+
+    stage = ManualStage(StageParams(kind="manual"), ask)
+    assert stage.move_to(math.radians(10)) == math.radians(10)
+    assert stage.move_to(math.radians(12)) == stage.where() == math.radians(12.5)
+    assert len(asked) == 4
+    assert not stage.laser_switchable
+    with pytest.raises(StageError, match="outside"):
+        stage.move_to(4.0)
+
+
+def test_manual_without_a_terminal_says_so() -> None:
+    def ask(_: str) -> str:
+        raise EOFError
+
+    with pytest.raises(StageError, match="needs a terminal"):
+        ManualStage(StageParams(kind="manual"), ask).move_to(1.0)
