@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 from recorded_shots import made_up_shots, record
 
 from scanmap.errors import CalibrationError, RecordingError
-from scanmap.recording import describe, open_source
+from scanmap.recording import describe, open_source, recover
 from scanmap.recording.mcap_records import CHUNK, Record, open_mcap, walk
 from scanmap.shot import Shot
 
@@ -148,3 +151,79 @@ def test_what_is_no_recording_is_told_in_one_line(tmp_path: Path, content: bytes
 def test_what_does_not_exist_names_what_can_be_replayed(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"does not exist.*\.mcap.*scan\.csv.*video"):
         open_source(tmp_path / "nothing.mcap")
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_recovery_makes_a_whole_file_of_what_is_whole(tmp_path: Path, seed: int) -> None:
+    from rosbags.highlevel import AnyReader
+
+    shots = made_up_shots(8, off=True)
+    whole = record(tmp_path / "whole.mcap", shots, rig_toml="description = 'mine'")
+    ends = chunk_ends(whole)
+    rng = np.random.default_rng(seed)
+    data = bytearray(whole.read_bytes())
+    lost = int(rng.integers(0, 7))
+    if seed % 2:
+        data[data.index(shots[lost].image) + 100] ^= 255
+        kept = [shot for shot in shots if shot.index != lost]
+    else:
+        del data[int(rng.integers(ends[lost + 1], ends[lost + 2])) :]
+        kept = shots[: lost + 1]
+    path, out = tmp_path / "broken.mcap", tmp_path / "saved.mcap"
+    path.write_bytes(data)
+    info = recover(path, out)
+    assert path.read_bytes() == data
+    assert (info.shots, info.cut_at, info.end_reason) == (len(kept), None, "finished" if seed % 2 else "cut")
+    source = open_source(out)
+    assert list(source.shots()) == kept
+    assert source.rig_toml == "description = 'mine'"
+    assert source.calibration().dumps() == open_source(whole).calibration().dumps()
+    assert source.metadata == open_source(whole).metadata
+    with AnyReader([out]) as reader:
+        assert sum(1 for _ in reader.messages()) == 4 * len(kept) + 1
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(path, out)
+
+
+def test_recovery_finds_the_topics_at_the_end_of_the_file(tmp_path: Path) -> None:
+    shots = made_up_shots(3)
+    path = record(tmp_path / "a.mcap", shots)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"sensor_msgs/msg/CompressedImage")] ^= 1
+    path.write_bytes(data)
+    assert recover(path, tmp_path / "saved.mcap").shots == 3
+    assert list(open_source(tmp_path / "saved.mcap").shots()) == shots
+
+
+def test_recovery_leaves_whole_and_empty_files_alone(tmp_path: Path) -> None:
+    whole = record(tmp_path / "whole.mcap", made_up_shots(2))
+    with pytest.raises(RecordingError, match="is whole, there is nothing to recover"):
+        recover(whole, tmp_path / "saved.mcap")
+    (tmp_path / "begun.mcap").write_bytes(whole.read_bytes()[:600])
+    with pytest.raises(RecordingError, match="no whole message"):
+        recover(tmp_path / "begun.mcap", tmp_path / "saved.mcap")
+    assert not (tmp_path / "saved.mcap").exists()
+
+
+def test_a_killed_program_loses_no_shot_it_has_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[2])\n"
+        "from recorded_shots import CALIBRATION, made_up_shots\n"
+        "from scanmap.recording import Recorder\n"
+        "recorder = Recorder(sys.argv[1], calibration=CALIBRATION, source='rig')\n"
+        "for shot in made_up_shots(10000, image_bytes=100):\n"
+        "    recorder.write(shot)\n"
+        "    print(shot.index, flush=True)\n"
+    )
+    arguments = [sys.executable, "-c", program, str(path), str(Path(__file__).parent)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for _ in range(50):
+            process.stdout.readline()
+        process.send_signal(signal.SIGKILL)
+        written = [50 + k for k, _ in enumerate(process.stdout, 1)][-1:] or [50]
+    got, faults = read(path)
+    assert written[0] <= len(got) <= written[0] + 1
+    assert got == made_up_shots(10000, image_bytes=100)[: len(got)]
+    assert "is cut" in faults[0]

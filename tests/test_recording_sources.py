@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from recorded_shots import CALIBRATION, START_NS, made_up_shots, record
 
-from scanmap.errors import ConfigError, RecordingError
+from scanmap.errors import ConfigError, RecordingError, ScanmapError
 from scanmap.recording import RecordingParams, describe, open_source
-from scanmap.shot import decode_image, encode_png
+from scanmap.shot import Shot, decode_image, encode_png
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -82,7 +84,7 @@ def test_an_unreadable_image_costs_its_own_shot(tmp_path: Path) -> None:
         ("frame,bearing_deg,time_s\na.jpg\n", "line 2: bearing_deg is ''.*line 2: time_s is ''"),
         ("frame,bearing_deg,time_s\na.jpg,1,soon\n", "line 2: time_s is 'soon'"),
         ("frame,bearing_deg,time_s\n,1,1\n", "line 2: frame is empty"),
-        ("frame,bearing_deg,time_s\n../../secret,1,1\n", "leads out of the folder"),
+        ("frame,bearing_deg,time_s\n../../secret,1,1\n", "is no name of a file in the folder"),
         ("frame,bearing_deg,time_s\n" + "a.jpg,x,1\n" * 9, "and 4 more"),
     ],
 )
@@ -98,6 +100,35 @@ def test_a_csv_that_is_no_text_is_told(tmp_path: Path) -> None:
     (folder / "scan.csv").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(ConfigError, match="is no csv"):
         open_source(folder)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=st.binary() | st.text().map(lambda text: b"frame,bearing_deg\n" + text.encode("utf-8", "replace")))
+@example(b"frame,bearing_deg\n" + b"9" * 5000 + b",1\n")
+@example(b"frame,bearing_deg\n" + b"n" * 5000 + b",1\n")
+@example(b"frame,bearing_deg\na\0b,1\n")
+@example(b'frame,bearing_deg\n"a,1\n')
+@example(b"frame,bearing_deg\n,1,2,3,4,5\n")
+def test_no_csv_breaks_the_reader(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "scan.csv").write_bytes(content)
+    with pytest.raises(ScanmapError) as caught:
+        list(open_source(tmp_path).shots())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_disk_that_fails_on_the_way_is_told(tmp_path: Path) -> None:
+    source = open_source(record(tmp_path / "a.mcap", made_up_shots(3)))
+    working = source.read
+
+    def failing(report: Callable[[str], None]) -> Iterator[Shot]:
+        yield next(working(report))
+        raise OSError(5, "Input/output error")
+
+    source.read = failing
+    shots = source.shots()
+    assert next(shots) == made_up_shots(3)[0]
+    with pytest.raises(RecordingError, match="cannot be read any further: Input/output error"):
+        next(shots)
 
 
 def test_a_csv_from_a_spreadsheet_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:

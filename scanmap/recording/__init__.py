@@ -4,6 +4,7 @@ from scanmap.recording.info import RecordingInfo, TopicInfo, describe
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_writer import Recorder, whole_ns
 from scanmap.recording.opening import open_source
+from scanmap.recording.recovery import recover
 from scanmap.recording.source import Source
 
 __all__ = [
@@ -14,5 +15,6 @@ __all__ = [
     "TopicInfo",
     "describe",
     "open_source",
+    "recover",
     "whole_ns",
 ]

@@ -44,7 +44,7 @@ def read_bearings(path: Path, *, frame_optional: bool = False) -> list[Row]:
     missing = [name for name in needed if name not in columns]
     if missing:
         raise ConfigError(
-            f"{path} lacks the column {' and '.join(missing)}: it has {', '.join(columns)}; it needs {HEADER}"
+            f"{path} lacks the column {' and '.join(missing)}: it has {_printed(columns)}; it needs {HEADER}"
         )
     faults: list[str] = []
     rows = list(_rows(lines[1:], columns, faults))
@@ -54,6 +54,11 @@ def read_bearings(path: Path, *, frame_optional: bool = False) -> list[Row]:
     if not rows:
         raise ConfigError(f"{path} has a header but no line with a frame")
     return rows
+
+
+def frame_number(frame: str) -> int | None:
+    """The number a frame is named by; None for a file name."""
+    return int(frame) if frame.isdecimal() and len(frame) <= 9 else None
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
@@ -81,6 +86,10 @@ def _rows(lines: list[tuple[int, list[str]]], columns: list[str], faults: list[s
         if not frame:
             faults.append(f"line {line}: frame is empty")
         yield Row(line, frame, math.radians(numbers["bearing_deg"]), numbers["time_s"])
+
+
+def _printed(columns: list[str]) -> str:
+    return ", ".join(name if name.isprintable() else repr(name) for name in columns)
 
 
 def _number(text: str) -> float | None:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from scanmap.errors import ConfigError, RecordingError
-from scanmap.recording.bearings import HEADER, Row, read_bearings
-from scanmap.recording.source import Report, Source
+from scanmap.recording.bearings import HEADER, Row, frame_number, read_bearings
+from scanmap.recording.source import Report, Source, text_beside
 from scanmap.shot import Shot
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -33,14 +33,14 @@ def frames_source(folder: Path) -> Source:
     rows = read_bearings(table)
     for row in rows:
         name = PurePosixPath(row.frame)
-        if name.is_absolute() or ".." in name.parts:
-            raise ConfigError(f"{table}: line {row.line}: frame {row.frame!r} leads out of the folder")
+        if name.is_absolute() or ".." in name.parts or not row.frame.isprintable():
+            raise ConfigError(f"{table}: line {row.line}: frame {row.frame!r} is no name of a file in the folder")
     return Source(
         path=folder,
         kind="frames",
         read=lambda report: _read(folder, rows, report),
-        calibration_toml=_text(folder / "calibration.toml"),
-        rig_toml=_text(folder / "rig.toml"),
+        calibration_toml=text_beside(folder / "calibration.toml"),
+        rig_toml=text_beside(folder / "rig.toml"),
         count=len(rows),
     )
 
@@ -65,9 +65,9 @@ def _read(folder: Path, rows: list[Row], report: Report) -> Iterator[Shot]:
 def _bytes(folder: Path, row: Row, report: Report) -> bytes | None:
     """The file of a row; a missing or unreadable one is reported."""
     names = [row.frame]
-    if row.frame.isdecimal():
-        names += [f"{int(row.frame):06d}{suffix}" for suffix in SUFFIXES]
-    path = next((folder / name for name in names if (folder / name).is_file()), None)
+    if (number := frame_number(row.frame)) is not None:
+        names += [f"{number:06d}{suffix}" for suffix in SUFFIXES]
+    path = next((folder / name for name in names if _is_file(folder / name)), None)
     if path is None:
         report(f"scan.csv line {row.line}: {folder / names[min(1, len(names) - 1)]} is missing and left out")
         return None
@@ -78,10 +78,8 @@ def _bytes(folder: Path, row: Row, report: Report) -> bytes | None:
         return None
 
 
-def _text(path: Path) -> str:
-    if not path.exists():
-        return ""
+def _is_file(path: Path) -> bool:
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from error
+        return path.is_file()
+    except OSError:  # a name longer than the file system takes
+        return False

@@ -30,7 +30,7 @@ class RecordingInfo:
     path: Path
     kind: str  # `recording`, `frames` or `video`
     source: str = ""  # the rig's name or `digital twin`; empty where nobody noted it
-    shots: int = 0  # counted, not as noted
+    shots: int = 0  # counted, images not opened: a damaged one counts
     duration_s: float = 0.0
     size_bytes: int = 0
     end_reason: str = ""  # `finished`, `interrupted`, `error: ...`; empty where nobody noted it

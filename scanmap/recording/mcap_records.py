@@ -57,6 +57,7 @@ class Message(NamedTuple):
     channel_id: int
     sequence: int
     log_time: int  # [ns]
+    publish_time: int  # [ns]
     data: memoryview
 
 
@@ -190,8 +191,8 @@ def message(view: memoryview) -> Message:
     """Parse a Message record. Raises DamagedError."""
     if len(view) < 22:
         raise DamagedError("a message in it is too short")
-    channel_id, sequence, log_time, _ = struct.unpack_from("<HIQQ", view)
-    return Message(channel_id, sequence, log_time, view[22:])
+    channel_id, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", view)
+    return Message(channel_id, sequence, log_time, publish_time, view[22:])
 
 
 def _chunk_content(data: bytes) -> bytes | memoryview:

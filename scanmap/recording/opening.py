@@ -27,12 +27,18 @@ def open_source(path: Path | str, params: RecordingParams | None = None, bearing
         ConfigError: a csv that its writer can correct.
     """
     path = Path(path)
-    params = params or RecordingParams()
+    try:
+        return _open(path, params or RecordingParams(), Path(bearings) if bearings is not None else None)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _open(path: Path, params: RecordingParams, bearings: Path | None) -> Source:
     if not path.exists():
         raise RecordingError(f"{path} does not exist; scanmap replays {KINDS}")
     if path.is_dir():
         is_bag = (path / "metadata.yaml").exists() or (not (path / "scan.csv").exists() and any(path.glob("*.mcap")))
         return mcap_source(path, params) if is_bag else frames_source(path)
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return video_source(path, Path(bearings) if bearings is not None else None)
+        return video_source(path, bearings)
     return mcap_source(path, params)

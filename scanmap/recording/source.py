@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from scanmap.calibration import Calibration
-from scanmap.errors import CalibrationError
+from scanmap.errors import CalibrationError, RecordingError
 from scanmap.recording.layout import DIGITAL_TWIN
 from scanmap.shot import Shot
 
@@ -36,7 +36,7 @@ class Source:
         `on_fault`, and reading goes on.
 
         Raises:
-            RecordingError: there is nothing to read at all.
+            RecordingError: there is nothing to read at all, or the disk fails.
         """
         self.faults.clear()
 
@@ -45,7 +45,13 @@ class Source:
             if on_fault is not None:
                 on_fault(fault)
 
-        return self.read(report)
+        return self._guarded(report)
+
+    def _guarded(self, report: Report) -> Iterator[Shot]:
+        try:
+            yield from self.read(report)
+        except OSError as error:
+            raise RecordingError(f"{self.path} cannot be read any further: {error.strerror or error}") from error
 
     @property
     def has_calibration(self) -> bool:
@@ -66,3 +72,17 @@ class Source:
     def is_twin(self) -> bool:
         """Whether it comes from the digital twin; what is made of it must say so."""
         return self.metadata.get("source") == DIGITAL_TWIN
+
+
+def text_beside(path: Path) -> str:
+    """Text of a file that may come along; empty where it does not.
+
+    Raises:
+        RecordingError: it is there but cannot be read.
+    """
+    if not path.exists():
+        return ""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from error

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from scanmap.errors import ConfigError, RecordingError
-from scanmap.recording.bearings import Row, read_bearings
-from scanmap.recording.source import Report, Source
+from scanmap.recording.bearings import Row, frame_number, read_bearings
+from scanmap.recording.source import Report, Source, text_beside
 from scanmap.shot import Shot, encode_png
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
@@ -34,12 +34,11 @@ def video_source(path: Path, bearings: Path | None = None) -> Source:
     table = bearings or _beside(path)
     rows = _by_frame(table, read_bearings(table, frame_optional=True))
     _opened(path).release()
-    calibration = path.parent / "calibration.toml"
     return Source(
         path=path,
         kind="video",
         read=lambda report: _read(path, table, rows, report),
-        calibration_toml=calibration.read_text(encoding="utf-8") if calibration.is_file() else "",
+        calibration_toml=text_beside(path.parent / "calibration.toml"),
         count=len(rows),
     )
 
@@ -57,13 +56,14 @@ def _beside(path: Path) -> Path:
 def _by_frame(table: Path, rows: list[Row]) -> dict[int, Row]:
     by_frame: dict[int, Row] = {}
     for row in rows:
-        if not row.frame.isdecimal():
+        number = frame_number(row.frame)
+        if number is None:
             raise ConfigError(
                 f"{table}: line {row.line}: frame {row.frame!r} is no frame number of a video (0, 1, ...)"
             )
-        if int(row.frame) in by_frame:
+        if number in by_frame:
             raise ConfigError(f"{table}: line {row.line}: frame {row.frame} is there twice")
-        by_frame[int(row.frame)] = row
+        by_frame[number] = row
     return by_frame
 
 
