@@ -6,6 +6,7 @@ number of motor steps, not what was asked for.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 
@@ -293,5 +294,7 @@ def _open_port(url: str, params: StageParams) -> GrblStage:
         dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
         return GrblStage(link, dialect, params)
     except BaseException:
+        with contextlib.suppress(StageError):
+            link.send_reset()  # it may be homing
         link.close()
         raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,3 +101,35 @@ class Modes:
     def line(self) -> str:
         """The answer to `$G`."""
         return f"[GC:{' '.join(self.codes.values())} T{self.tool} F{self.feed:g} S{self.speed:g}]"
+
+
+class StatusReport(NamedTuple):
+    """What a board knows when it is asked `?`."""
+
+    state: str
+    braking: bool  # a hold has not come to rest yet
+    position: NDArray[np.float64]  # machine position [units]
+    offset: NDArray[np.float64]  # work zero seen from machine zero [units]
+    speed: float  # [units/s]
+    laser_power: float
+    free: tuple[int, int]  # blocks of the planner, bytes of the receive buffer
+
+    def line(self, settings: dict[int, float], *, with_offset: bool, with_overrides: bool) -> str:
+        """As `$10` and `$13` want it; offset and overrides come with some reports only, as on the real board."""
+        mask = int(settings[10])
+        inch = 25.4 if settings[13] else 1.0
+        fields = [f"{self.state}:{int(self.braking)}" if self.state == "Hold" else self.state]
+        place = self.position - (0 if mask & 1 else self.offset)
+        fields.append(("MPos:" if mask & 1 else "WPos:") + _triple(place / inch))
+        if mask & 2:
+            fields.append(f"Bf:{self.free[0]},{self.free[1]}")
+        fields.append(f"FS:{self.speed * 60 / inch:.0f},{self.laser_power:.0f}")
+        if with_offset:
+            fields.append("WCO:" + _triple(self.offset / inch))
+        elif with_overrides:
+            fields.append("Ov:100,100,100" + ("|A:S" if self.laser_power else ""))
+        return f"<{'|'.join(fields)}>"
+
+
+def _triple(values: NDArray[np.float64]) -> str:
+    return ",".join(f"{value:.3f}" for value in values)

@@ -1,29 +1,25 @@
-"""What the twin's board does with a line: `$` commands, settings, G-code, homing.
+"""What the twin's board does with a line of G-code: modes, moves, jogs, probing, laser.
 
-Source: gnea/grbl, doc/markdown/commands.md, settings.md, jogging.md. Lines that must wait are generators: they
+Source: gnea/grbl, doc/markdown/commands.md, jogging.md, laser_mode.md. Lines that must wait are generators: they
 yield the time before which nothing will happen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.twin.board import BUILD_INFO, Modes
+from scanmap.twin.board import Modes
 from scanmap.twin.gcode import GcodeError, Words, read_words
+from scanmap.twin.system_commands import Answer, SystemCommands, Wait
 
 if TYPE_CHECKING:
     from scanmap.twin.firmware import Firmware
 
-Wait = Generator[float, None, None]
-Answer = Generator[float, None, int]  # grbl's error number, 0 for ok
-
 MARK_DEG = 0.2  # half the width of the index mark
-_SEARCH = 1.5  # homing looks as far as this times $130
 
 
 class Executor:
@@ -33,7 +29,8 @@ class Executor:
         self._board = board
         self.modes = Modes()
         self.laser_power = 0.0  # S word while M3 or M4 is on
-        self._apply_steps()
+        self._system = SystemCommands(board, self)
+        self.apply_steps()
 
     def work_offset(self) -> NDArray[np.float64]:
         """Work zero seen from machine zero [units]."""
@@ -52,99 +49,17 @@ class Executor:
         if not line:
             return 0
         if line.startswith("$"):
-            return (yield from self._system(line[1:]))
+            return (yield from self._system.execute(line[1:]))
         if board.alarm or board.planner.jogging:
             return 9
         return (yield from self._gcode(line))
 
-    def _system(self, command: str) -> Answer:
-        board = self._board
-        if command.startswith("J="):
-            if board.alarm or board.checking or (board.planner.busy and not board.planner.jogging):
-                return 8
-            return (yield from self._jog(command[2:]))
-        anytime: dict[str, Callable[[], None]] = {
-            "": self._help,
-            "X": self._unlock,
-            "G": lambda: board.say(self.modes.line()),
-        }
-        if command in anytime:
-            anytime[command]()
-            return 0
-        if board.planner.busy:
-            return 8
-        if command == "H" or (command == "HX" and board.dialect != "grbl"):
-            return (yield from self._home())
-        return self._idle_command(command)
-
-    def _help(self) -> None:
-        self._board.say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
-
-    def _unlock(self) -> None:
-        if self._board.alarm:
-            self._board.say("[MSG:Caution: Unlocked]")
-            self._board.alarm = False
-
-    def _idle_command(self, command: str) -> int:
-        """Commands that need a board at rest."""
-        board, memory = self._board, self._board.memory
-        offsets = {**memory.offsets, "G92": self.modes.g92}
-        reports = {
-            "I": BUILD_INFO[board.dialect],
-            "N": [f"$N{number}={line}" for number, line in enumerate(memory.startup)],
-            "#": [f"[{name}:{x:.3f},{y:.3f},{z:.3f}]" for name, (x, y, z) in offsets.items()],
-        }
-        if board.dialect != "FluidNC":
-            reports["$"] = memory.lines()
-        for line in reports.get(command, ()):
-            board.say(line)
-        if command in reports:
-            return 0
-        if command[:3] in ("N0=", "N1="):
-            memory.startup[int(command[1])] = command[3:]
-            memory.writes += 1
-        elif command == "SLP":
-            board.asleep = True
-            self.laser_power = 0.0
-        elif command == "C":
-            board.checking = not board.checking
-            board.say("[MSG:Enabled]" if board.checking else "[MSG:Disabled]")
-            board.restart_requested = not board.checking
-        else:
-            return self._fluidnc(command) if board.dialect == "FluidNC" else self._store(command)
-        return 0
-
-    def _fluidnc(self, command: str) -> int:
-        """FluidNC has its machine in a YAML tree and no numbered settings to write."""
-        board, settings = self._board, self._board.memory.settings
-        tree = {
-            "/axes/x/steps_per_mm": f"{settings[100]:.3f}",
-            "/axes/x/max_rate_mm_per_min": f"{settings[110]:.3f}",
-            "/stepping/idle_ms": f"{settings[1]:.0f}",
-        }
-        if command == "MD":
-            board.release_motor()
-        elif command.lower() in tree:
-            board.say(f"${command.lower()}={tree[command.lower()]}")
-        else:
-            return 3
-        return 0
-
-    def _store(self, command: str) -> int:
-        name, equals, text = command.partition("=")
-        try:
-            number, value = int(name), float(text)
-        except ValueError:
-            return 2 if name.isdigit() and equals else 3
-        error = self._board.memory.store(number, value)
-        self._apply_steps()
-        return error
-
-    def _apply_steps(self) -> None:
+    def apply_steps(self) -> None:
+        """`$100` to `$102` have changed."""
         settings = self._board.memory.settings
         self._board.planner.set_steps_per_unit(np.array([settings[100], settings[101], settings[102]]))
 
-    def _synchronise(self) -> Wait:
+    def synchronise(self) -> Wait:
         """Until all that was planned is done."""
         while self._board.planner.busy:
             yield self._board.planner.end_time
@@ -183,7 +98,7 @@ class Executor:
         if moves:
             yield from self._move(words, motion, feed)
         if words.codes.get("stopping") in ("M2", "M30"):
-            yield from self._synchronise()
+            yield from self.synchronise()
             self.laser_power = 0.0
             self.modes = Modes()
             self._board.say("[MSG:Pgm End]")
@@ -196,7 +111,7 @@ class Executor:
         spindle = words.codes.get("spindle", self.modes.codes["spindle"])
         changes = "spindle" in words.codes or ("S" in words.values and spindle != "M5")
         if changes and not self._board.checking:
-            yield from self._synchronise()
+            yield from self.synchronise()
             limit = self._board.memory.settings[30]
             self.laser_power = 0.0 if spindle == "M5" else min(self.modes.speed, limit)
         self.modes.codes["spindle"] = spindle
@@ -204,7 +119,7 @@ class Executor:
     def _dwell(self, seconds: float) -> Wait:
         if self._board.checking:
             return
-        yield from self._synchronise()
+        yield from self.synchronise()
         end = self._board.present + seconds
         while self._board.present < end:
             yield end
@@ -252,14 +167,14 @@ class Executor:
             board.raise_alarm(2)
             yield from self._halt()
         if motion == "G38.2":
-            yield from self._synchronise()
+            yield from self.synchronise()
             yield from self._probe(target, feed)
             return
         while board.planner.full:
             yield board.planner.next_time
-        self._plan(target, None if motion == "G0" else feed, is_jog=False)
+        self.plan(target, None if motion == "G0" else feed, is_jog=False)
 
-    def _plan(self, target: NDArray[np.float64], feed: float | None, *, is_jog: bool) -> None:
+    def plan(self, target: NDArray[np.float64], feed: float | None, *, is_jog: bool) -> None:
         """Limit speed and acceleration so that no axis exceeds its own, and queue the move."""
         board, settings = self._board, self._board.memory.settings
         way = np.abs(target - board.planner.target())
@@ -272,7 +187,8 @@ class Executor:
         speed = min(feed or fastest, fastest) / 60
         board.planner.add(target, speed, acceleration, board.present, is_jog)
 
-    def _jog(self, text: str) -> Answer:
+    def jog(self, text: str) -> Answer:
+        """Carry out what follows `$J=`."""
         try:
             words = read_words(text)
         except GcodeError as error:
@@ -286,7 +202,7 @@ class Executor:
             return 15
         while self._board.planner.full:
             yield self._board.planner.next_time
-        self._plan(target, words.values["F"] * self._scale(words), is_jog=True)
+        self.plan(target, words.values["F"] * self._scale(words), is_jog=True)
         return 0
 
     def _beyond_travel(self, target: NDArray[np.float64]) -> bool:
@@ -304,39 +220,9 @@ class Executor:
             return
         mark = None if board.index_deg is None else start[0] + board.index_deg - board.drivetrain.bearing_deg
         found = mark is not None and min(start[0], target[0]) <= mark <= max(start[0], target[0])
-        self._plan(np.array([mark, *start[1:]]) if found else target, feed, is_jog=False)
-        yield from self._synchronise()
+        self.plan(np.array([mark, *start[1:]]) if found else target, feed, is_jog=False)
+        yield from self.synchronise()
         x, y, z = board.planner.position()
         board.say(f"[PRB:{x:.3f},{y:.3f},{z:.3f}:{int(found)}]")
         if not found:
             board.raise_alarm(5)
-
-    def _home(self) -> Answer:
-        """Seek the switch, back off, and name the place. Silent meanwhile, as the real one is."""
-        board, settings = self._board, self._board.memory.settings
-        if not settings[22]:
-            return 5
-        board.homing, board.alarm = True, False
-        toward = -1.0 if int(settings[23]) & 1 else 1.0
-        distance = math.inf if board.switch_deg is None else (board.switch_deg - board.drivetrain.bearing_deg) * toward
-        found = 0 <= distance <= _SEARCH * settings[130]
-        travel = distance if found else _SEARCH * settings[130]
-        yield from self._creep(toward * travel, settings[25])
-        if found:
-            yield from self._creep(-toward * settings[27], settings[24])
-        board.homing = False
-        if not found:
-            board.raise_alarm(9)
-            board.restart_requested = True
-            return 0
-        place = -settings[27] if toward > 0 else settings[27] - settings[130]
-        board.planner.set_counter(0, round(place * settings[100]))
-        board.go_idle()
-        yield from self.run_startup()
-        return 0
-
-    def _creep(self, distance: float, rate: float) -> Wait:
-        target = self._board.planner.position()
-        target[0] += distance
-        self._plan(target, rate, is_jog=False)
-        yield from self._synchronise()

@@ -15,28 +15,16 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass, field
 
-from scanmap.twin.board import BANNERS, DialectName, Memory
+from scanmap.twin.board import BANNERS, DialectName, Memory, StatusReport
 from scanmap.twin.executor import Executor
 from scanmap.twin.motion import Drivetrain
-from scanmap.twin.planner import Planner, Position
+from scanmap.twin.planner import Planner
+from scanmap.twin.serial_line import Faults, SerialLine
 
 RX_BYTES = {"grbl": 128, "grblHAL": 1024, "FluidNC": 256}
 LINE_CHARACTERS = 79
 
 _CRITICAL_ALARMS = {1, 2}  # these halt the board until it is reset
-
-
-@dataclass
-class Faults:
-    """What can go wrong. Plain attributes: turn any of them at any time; counts run down by themselves."""
-
-    latency_s: float = 0.0  # every answer comes that much later
-    lose_status: int = 0  # so many of the next `?` go unanswered
-    lose_ok: int = 0  # so many of the next `ok` get lost on the way
-    lose_lines: int = 0  # so many of the next lines never reach the board
-    garbage: bytes = b""  # noise before the next answer
-    mute: bool = False  # the board hangs
-    unplugged: bool = False  # the cable is out
 
 
 @dataclass
@@ -57,7 +45,7 @@ class Firmware:
         self._epoch = time.monotonic()
         self._now = 0.0
         self._rx: deque[int] = deque()
-        self._tx: deque[tuple[float, bytes]] = deque()
+        self._line = SerialLine(self.faults)
         self._executor: Executor
         self._power_up()
 
@@ -107,7 +95,7 @@ class Firmware:
         with self._lock:
             self._live()
             self.planner.abort(self._now)
-            self._tx.clear()
+            self._line.clear()
             self._power_up()
             self._live()
 
@@ -150,37 +138,23 @@ class Firmware:
         """Bytes that have arrived at the host by now, at most `size`."""
         with self._lock:
             self._live()
-            out = bytearray()
-            while self._tx and self._tx[0][0] <= self._now and len(out) < size:
-                due, data = self._tx.popleft()
-                room = size - len(out)
-                out += data[:room]
-                if data[room:]:
-                    self._tx.appendleft((due, data[room:]))
-            return bytes(out)
+            return self._line.take(size, self._now)
 
     def waiting(self) -> int:
         """Bytes that have arrived at the host by now."""
         with self._lock:
             self._live()
-            return sum(len(data) for due, data in self._tx if due <= self._now)
+            return self._line.waiting(self._now)
 
     def next_event(self) -> float:
         """Seconds until the board does something by itself; infinity if it only waits for bytes."""
         with self._lock:
             self._live()
-            due = self._tx[0][0] if self._tx else math.inf
-            return max(0.0, min(due, self._wake, self.planner.next_time) - self._now)
+            return max(0.0, min(self._line.next_time, self._wake, self.planner.next_time) - self._now)
 
     def say(self, line: str) -> None:
         """Send a line to the host."""
-        if self.faults.mute:
-            return
-        if line == "ok" and self.faults.lose_ok > 0:
-            self.faults.lose_ok -= 1
-            return
-        noise, self.faults.garbage = self.faults.garbage, b""
-        self._tx.append((self._now + self.faults.latency_s, noise + line.encode("ascii") + b"\r\n"))
+        self._line.send(line, self._now)
 
     def go_idle(self) -> None:
         """Motion has ended: the motor lets go unless `$1` is 255."""
@@ -304,31 +278,21 @@ class Firmware:
         return next((name for name, is_so in flags.items() if is_so), "Idle")
 
     def _report(self) -> None:
-        """The answer to `?`; work offset and overrides come with some reports only, as on the real board."""
+        """The answer to `?`."""
         if self._halted:
             return
         if self.faults.lose_status > 0:
             self.faults.lose_status -= 1
             return
-        state = self._state()
-        fields = [f"{state}:{int(self.planner.moving)}" if state == "Hold" else state]
-        mask = int(self.memory.settings[10])
-        inch = 25.4 if self.memory.settings[13] else 1.0
-        offset = self._executor.work_offset()
-        place = self.planner.position() - (0 if mask & 1 else offset)
-        fields.append(("MPos:" if mask & 1 else "WPos:") + _triple(place / inch))
-        if mask & 2:
-            fields.append(f"Bf:{self.planner.free_blocks},{RX_BYTES[self.dialect] - len(self._rx)}")
-        feed = self.planner.speed(self._now) * 60 / inch
-        fields.append(f"FS:{feed:.0f},{self._executor.laser_power:.0f}")
         turn = self._reports % (30 if self.planner.busy else 10)
         self._reports += 1
-        if turn == 0:
-            fields.append("WCO:" + _triple(offset / inch))
-        elif turn == 1:
-            fields.append("Ov:100,100,100" + ("|A:S" if self._executor.laser_power else ""))
-        self.say(f"<{'|'.join(fields)}>")
-
-
-def _triple(values: Position) -> str:
-    return ",".join(f"{value:.3f}" for value in values)
+        report = StatusReport(
+            state=self._state(),
+            braking=self.planner.moving,
+            position=self.planner.position(),
+            offset=self._executor.work_offset(),
+            speed=self.planner.speed(self._now),
+            laser_power=self._executor.laser_power,
+            free=(self.planner.free_blocks, RX_BYTES[self.dialect] - len(self._rx)),
+        )
+        self.say(report.line(self.memory.settings, with_offset=turn == 0, with_overrides=turn == 1))

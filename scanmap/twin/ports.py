@@ -10,6 +10,7 @@ import select
 import threading
 import time
 from collections.abc import Iterator
+from itertools import chain, count
 from typing import Any
 
 from scanmap.twin.firmware import Firmware
@@ -90,13 +91,12 @@ def _pass_time(board: Firmware, started: float, timeout: float | None) -> bool:
 
 @contextlib.contextmanager
 def plug(firmware: Firmware, name: str = "head") -> Iterator[str]:
-    """Plug a board in while the context lasts; yields its URL, `twin://name`."""
+    """Plug a board in while the context lasts; yields its URL, `twin://name`, numbered if the name is taken."""
     import serial
 
     if "scanmap.twin" not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append("scanmap.twin")
-    if name in _PLUGGED:
-        raise ValueError(f"a twin named {name!r} is already plugged in; give another name")
+    name = next(free for free in chain([name], map(f"{name}-{{}}".format, count(2))) if free not in _PLUGGED)
     _PLUGGED[name] = firmware
     try:
         yield f"twin://{name}"
