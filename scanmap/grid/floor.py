@@ -1,0 +1,155 @@
+"""Find the floor in a scan and level the scan on it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.geometry import rigid
+from scanmap.scan import Scan
+
+Array = NDArray[np.float64]
+
+# A surface climbing less than this between two rows of a bearing is taken for horizontal.
+_HORIZONTAL_SLOPE = np.tan(np.radians(15.0))
+# Fewer candidates than this on the best plane, and there is no floor in view.
+_MIN_SUPPORT = 40
+# How far a scanner put up by hand leans [rad]: it decides where the view alone cannot tell, as with one bearing.
+_LEAN = np.radians(2.0)
+
+
+class Floor(NamedTuple):
+    """The floor of a scan, and how it was found."""
+
+    plane: Array  # (4,) n.x + d = 0 in the world frame [m], n up: n.p + d is the height of p above the floor
+    sigma_m: float  # rms distance of its points from the plane; NaN where it was not fitted
+    points: int  # how many points (of a thinned scan) it stands on
+    how: Literal["fitted", "given", "lowest"]
+
+    @property
+    def laser_height_m(self) -> float:
+        """Height of the world's origin, the laser, above the floor [m]."""
+        return float(self.plane[3])
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the rotation axis and the floor's normal [deg]."""
+        return float(np.degrees(np.arccos(np.clip(self.plane[2], -1.0, 1.0))))
+
+    @property
+    def T_level_world(self) -> Array:
+        """(4, 4) world frame to the level frame: same vertical through the origin, z = height above the floor.
+
+        The smallest rotation that brings the floor's normal to z (Rodrigues).
+        """
+        nx, ny, nz = self.plane[:3]
+        v = np.array([ny, -nx, 0.0])  # n x z
+        K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+        return rigid(np.eye(3) + K + K @ K / (1.0 + nz), [0.0, 0.0, self.plane[3]])
+
+    @property
+    def words(self) -> str:
+        """How the floor was found, as a summary prints it."""
+        place = f"{self.laser_height_m:.3f} m below the laser"
+        if self.how == "fitted":
+            return f"floor {place}, tilted {self.tilt_deg:.2f} deg, rms {1e3 * self.sigma_m:.1f} mm"
+        if self.how == "given":
+            return f"no floor in view: taken {place} as configured"
+        return f"no floor in view: lowest points taken for it, {place}; set grid.laser_height_m if you know better"
+
+
+def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: float = 8.0) -> Floor:
+    """The floor plane of a scan, by a robust fit to low and nearly horizontal points.
+
+    Candidates are points whose bearing runs on nearly level to the rows next to them. Over a grid of tilts
+    the lowest strong layer of candidates is looked for (a table top has points below it, a floor has not);
+    iteratively reweighted least squares with a weak prior on the tilt then refine it.
+
+    Args:
+        scan: points in the world frame.
+        laser_height_m: where the floor is taken to be when none is in view; None: at the lowest points.
+        max_tilt_deg: largest tilt of the axis against the floor's normal that is looked for.
+    """
+    points, sigma, level = _candidates(scan)
+    low = points[:, 2] < -0.02
+    seed = _lowest_layer(points[level & low], np.radians(max_tilt_deg))
+    if seed is not None:
+        slope, inliers, rms = _refine(points[level & low], sigma[level & low], seed)
+        steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
+        if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep:
+            return Floor(_plane(slope), rms, inliers, "fitted")
+    if laser_height_m is not None:
+        return Floor(np.array([0.0, 0.0, 1.0, laser_height_m]), np.nan, 0, "given")
+    lowest = float(np.percentile(points[:, 2], 1.0)) if len(points) else 0.0
+    return Floor(np.array([0.0, 0.0, 1.0, -lowest]), np.nan, int((points[:, 2] <= lowest).sum()), "lowest")
+
+
+def _plane(slope: Array) -> Array:
+    """z = a x + b y + c as n.x + d = 0 with n up."""
+    plane = np.array([-slope[0], -slope[1], 1.0, -slope[2]])
+    scaled: Array = plane / np.linalg.norm(plane[:3])
+    return scaled
+
+
+def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Thinned points (N, 3), their sigma (N,) and whether the surface there is nearly horizontal (N,)."""
+    across, down = max(1, len(scan) // 120), max(1, scan.rows // 150)
+    points = scan.points[::across, ::down].astype(np.float64)
+    sigma = np.nan_to_num(scan.sigma_m[::across, ::down].astype(np.float64))
+    origins = np.array([scan.mount.T_world_head(float(b))[:3, 3] for b in scan.bearings[::across]]).reshape(-1, 3)
+    rho = np.hypot(*np.moveaxis(points[..., :2] - origins[:, None, :2], -1, 0))
+    level = np.zeros(rho.shape, dtype=bool)
+    dz, dr = np.diff(points[..., 2], axis=1), np.abs(np.diff(rho, axis=1))
+    # A short step says nothing about the slope where its ranges are noise.
+    noise = 2.0 * np.maximum(sigma[:, 1:], sigma[:, :-1])
+    flat = (np.abs(dz) < _HORIZONTAL_SLOPE * dr) & (dr > noise)
+    level[:, 1:] |= flat
+    level[:, :-1] |= flat
+    some = np.isfinite(points).all(axis=-1)
+    return points[some], sigma[some], level[some]
+
+
+def _lowest_layer(points: Array, max_tilt: float) -> Array | None:
+    """z = a x + b y + c (3,) of the layer with most points in it and fewest below, coarsely; None without one."""
+    if len(points) < _MIN_SUPPORT:
+        return None
+    points = points[:: max(1, len(points) // 3000)]
+    tilts = np.tan(np.linspace(-max_tilt, max_tilt, 9))
+    thick = 0.05
+    best, seed = -np.inf, None
+    for a in tilts:
+        for b in tilts:
+            height = points[:, 2] - a * points[:, 0] - b * points[:, 1]
+            bottom = height.min()
+            count = np.bincount(((height - bottom) / thick).astype(np.intp))
+            layer = np.convolve(count, [1, 1])[1:]  # two bins, so that no layer is cut in half
+            below = np.cumsum(count) - count
+            # Level wins between equals.
+            score = layer - 2.0 * below - 0.02 * len(points) * np.hypot(a, b) / max(np.tan(max_tilt), 1e-9)
+            k = int(score.argmax())
+            if score[k] > best:
+                best, seed = float(score[k]), np.array([a, b, bottom + (k + 1.0) * thick])
+    return seed
+
+
+def _refine(points: Array, sigma: Array, slope: Array) -> tuple[Array, int, float]:
+    """Least squares over ever closer points: slope (3,), number of inliers, their rms [m]."""
+    A = np.column_stack([points[:, :2], np.ones(len(points))])
+    inlier = np.zeros(len(points), dtype=bool)
+    residual: NDArray[Any] = points[:, 2] - A @ slope
+    for gate in (0.15, 0.08, 0.05, 0.03, 0.03):
+        # Height follows the ray's error by less than one; sigma as it is makes a generous gate.
+        inlier = np.abs(residual) < np.maximum(gate, 2.0 * np.minimum(sigma, 0.05))
+        if inlier.sum() < 3:
+            break
+        weight = inlier / (sigma**2 + 0.003**2)
+        normal = A.T @ (A * weight[:, None])
+        # Points of one bearing share their errors; a hundred of them tell the slope as one would.
+        normal[[0, 1], [0, 1]] += 100.0 / _LEAN**2
+        slope = np.linalg.solve(normal, A.T @ (weight * points[:, 2]))
+        residual = points[:, 2] - A @ slope
+    count = int(inlier.sum())
+    rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if count else np.nan
+    return slope, count, rms
