@@ -1,0 +1,150 @@
+"""The thesis's own view: its four pictures, and its numbers for one chosen row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.calibration import Calibration
+from scanmap.errors import CalibrationError, ConfigError
+from scanmap.laserline import LaserLineParams
+from scanmap.pipeline import Step
+from scanmap.shot import Image, decode_image
+from scanmap.triangulation import (
+    TriangulationParams,
+    locate,
+    pixel_angle_model_of,
+    pixel_ratio,
+    ratio_model_of,
+)
+from scanmap.view import entities as at
+from scanmap.view.entities import ViewParams
+from scanmap.view.pictures import Picture, jpeg, png, shrink_factor, shrunk, shrunk_lines
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+Array = NDArray[np.float64]
+
+PAINT = {"red": (0, 0, 255), "green": (0, 255, 0), "blue": (255, 0, 0)}  # BGR
+ROW_COLOUR = (255, 210, 60, 150)
+
+_MODELS = {
+    "algorithm_1": ("Algorithm 1, pixel ratio", TriangulationParams(model="ratio"), (255, 170, 60)),
+    "algorithm_2": ("Algorithm 2, pixel angle", TriangulationParams(model="pixel_angle"), (90, 170, 255)),
+    "calibrated": ("calibrated plane", TriangulationParams(model="plane"), (110, 230, 120)),
+}
+
+
+class ThesisView:
+    """Logs shots the way the thesis's program showed them (features T5 to T9 and T11)."""
+
+    def __init__(
+        self, recording: rr.RecordingStream, calibration: Calibration, laserline: LaserLineParams, params: ViewParams
+    ) -> None:
+        """Raises ConfigError where `params.row` is not a row of the image."""
+        own = calibration.intrinsics
+        self._recording = recording
+        self._calibration, self._models = _with_models(calibration)
+        self._laserline = laserline
+        self._params = params
+        self._row = chosen_row(own.height, params)
+        self._shrink = shrink_factor(own.width, params.thesis_width_px)
+        self._log_constant()
+
+    def log_numbers(self, step: Step) -> None:
+        """`ppx`, `p` and the distance by both algorithms and by the calibration, of the chosen row."""
+        import rerun as rr
+
+        log = self._recording.log
+        ppx = step.line.column_px[self._row : self._row + 1]
+        log(at.THESIS_PPX, rr.Scalars(ppx))
+        log(at.THESIS_P, rr.Scalars(pixel_ratio(ppx, self._calibration.intrinsics.width)))
+        for name in self._models:
+            points, _, _ = locate(ppx, np.array([float(self._row)]), self._calibration, _MODELS[name][1])
+            log(f"{at.THESIS_DISTANCE}/{name}", rr.Scalars(points[:, 0]))
+
+    def log_pictures(self, step: Step) -> None:
+        """Original, grey, line image and overlay of a shot.
+
+        Raises:
+            CameraError: its image cannot be decoded.
+        """
+        import rerun as rr
+
+        for path, picture in self._pictures(decode_image(step.shot.image).image).items():
+            self._recording.log(path, rr.EncodedImage(contents=picture.data, media_type=picture.media_type))
+
+    def _pictures(self, image: Image) -> dict[str, Picture]:
+        quality, k = self._params.jpeg_quality, self._shrink
+        grey = _grey(image)
+        lines = shrunk_lines(binary_image(grey), k)
+        # One pixel beside a saturated line would vanish in a window smaller than the picture.
+        broad = np.asarray(cv2.dilate(lines, np.ones((1, 3), np.uint8)), np.uint8)
+        small = shrunk(grey, k)
+        return {
+            at.THESIS_ORIGINAL: jpeg(shrunk(image, k), quality),
+            at.THESIS_GREY: jpeg(small, quality),
+            at.THESIS_BINARY: png(lines),
+            at.THESIS_OVERLAY: jpeg(overlay(small, broad, self._params.overlay_colour), quality),
+        }
+
+    def _log_constant(self) -> None:
+        """The chosen row in each picture, and the names of the plots."""
+        import rerun as rr
+
+        log = self._recording.log
+        v, width = (self._row + 0.5) / self._shrink, self._calibration.intrinsics.width / self._shrink
+        for path in (at.THESIS_ORIGINAL, at.THESIS_GREY, at.THESIS_BINARY, at.THESIS_OVERLAY):
+            strip = rr.LineStrips2D([[[0.0, v], [width, v]]], colors=ROW_COLOUR, radii=-0.75)
+            log(f"{path}/row", strip, static=True)
+        log(at.THESIS_PPX, rr.SeriesLines(names=f"ppx of row {self._row} [px]", colors=(255, 90, 90)), static=True)
+        log(at.THESIS_P, rr.SeriesLines(names="p = (l - ppx) / l", colors=(200, 160, 255)), static=True)
+        for name in self._models:
+            words, _, colour = _MODELS[name]
+            log(f"{at.THESIS_DISTANCE}/{name}", rr.SeriesLines(names=f"{words} [m]", colors=colour), static=True)
+
+
+def chosen_row(height: int, params: ViewParams) -> int:
+    """The row whose numbers are shown.
+
+    Raises:
+        ConfigError: an image of this height has no such row.
+    """
+    row = height // 2 if params.row is None else params.row
+    if row >= height:
+        raise ConfigError(f"view.row = {row} is not a row of the image; choose 0 to {height - 1}")
+    return row
+
+
+def _with_models(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]]:
+    """The calibration with both algorithms' constants, fitted where it has none; and which models this head has."""
+    try:
+        calibration = replace(calibration, ratio=ratio_model_of(calibration))
+        calibration = replace(calibration, pixel_angle=pixel_angle_model_of(calibration))
+    except CalibrationError:
+        pass
+    has = {"algorithm_1": calibration.ratio, "algorithm_2": calibration.pixel_angle, "calibrated": True}
+    return calibration, tuple(name for name, there in has.items() if there)
+
+
+def _grey(image: Image) -> Image:
+    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2])
+
+
+def binary_image(grey: Image) -> Image:
+    """The brightest pixel of each row 255, everything else 0 (T6)."""
+    lines = np.zeros_like(grey)
+    lines[np.arange(len(grey)), grey.argmax(axis=1)] = 255
+    return lines
+
+
+def overlay(grey: Image, lines: Image, colour: Literal["red", "green", "blue"]) -> Image:
+    """(H, W, 3) BGR: the grey image with the pixels of a line image painted (T7)."""
+    painted = np.repeat(grey[:, :, None], 3, axis=2)
+    painted[lines > 0] = PAINT[colour]
+    return painted
