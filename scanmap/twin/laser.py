@@ -141,13 +141,16 @@ class LaserFan:
 
     def draw(self, line: LitLine) -> LineLight:
         """The line's light on the sensor, without glare and noise."""
-        starts = np.flatnonzero(self._joined(line))
+        joined = self._joined(line)
+        starts = np.flatnonzero(joined)
         if not len(starts):
             return LineLight(0, np.zeros((self._height, 0, 3), np.float32))
         step = line.pixel[starts + 1] - line.pixel[starts]
+        # Where a piece ends the surface goes on, on average, for half the way to the ray that missed it.
+        ends = np.stack([np.where(joined[starts - 1], 0.0, -0.5), np.where(joined[starts + 1], 1.0, 1.5)], axis=1)
         upright = np.abs(step[:, 1]) >= np.abs(step[:, 0])
-        by_row = self._splats(line, starts[upright], along=1, limit=self._height)
-        by_column = self._splats(line, starts[~upright], along=0, limit=self._width)
+        by_row = self._splats(line, starts[upright], ends[upright], along=1)
+        by_column = self._splats(line, starts[~upright], ends[~upright], along=0)
         row = np.concatenate([by_row[0], by_column[1]])
         column = np.concatenate([by_row[1], by_column[0]])
         light = np.concatenate([by_row[2], by_column[2]])
@@ -170,30 +173,27 @@ class LaserFan:
         return np.append(same & (off < 2e-3), False)
 
     def _splats(
-        self, line: LitLine, starts: NDArray[np.intp], along: int, limit: int
+        self, line: LitLine, starts: NDArray[np.intp], ends: Array, along: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Pixels and light of segments from hits `starts` to the next, cut at every half row (along 1) or column (0).
 
+        A segment covers the parts `ends` (S, 2) of the way: 0 to 1, or somewhat more at the end of a piece.
         Returns the pixel along (K,), the pixel across (K,) and the light (K, 3).
         """
         from scipy.special import ndtr
 
         parts = 2
         side = 1 - along
-        a, b = line.pixel[starts], line.pixel[starts + 1]
-        low, high = (
-            np.ceil((f(a[:, along], b[:, along]) + 0.5) * parts - 0.5).astype(np.int64)
-            for f in (np.minimum, np.maximum)
-        )
+        a, step = line.pixel[starts], line.pixel[starts + 1] - line.pixel[starts]
+        extent = a[:, along, None] + ends * step[:, along, None]
+        low, high = np.ceil((np.sort(extent, axis=1).T + 0.5) * parts - 0.5).astype(np.int64)
         count = high - low
         k = np.repeat(np.arange(len(starts)), count)
         cut = low[k] + np.arange(len(k)) - np.repeat(np.cumsum(count) - count, count)
-        usable = (cut >= 0) & (cut < parts * limit)
-        k, cut = k[usable], cut[usable]
-        step = b[k] - a[k]
-        part = ((cut + 0.5) / parts - 0.5 - a[k, along]) / step[:, along]
+        a, step = a[k], step[k]
+        part = ((cut + 0.5) / parts - 0.5 - a[:, along]) / step[:, along]
         i = starts[k]
-        centre = a[k, side] + part * step[:, side]
+        centre = a[:, side] + part * step[:, side]
         slope = step[:, side] / step[:, along]
         across = line.across[i] + part[:, None] * (line.across[i + 1] - line.across[i])
         sheet = np.abs(across[:, side] - slope * across[:, along])
