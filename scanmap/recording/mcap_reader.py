@@ -76,6 +76,7 @@ def _carries(channel: Channel, topic: str, message_type: str) -> bool:
 
 def _no_topic(path: Path, directory: Directory, topic: str, message_type: str) -> str:
     there = sorted(f"{c.topic} ({c.message_type or c.encoding})" for c in directory.channels.values())
+    there = [name if name.isprintable() else repr(name) for name in there]
     key = "image_topic" if message_type == layout.COMPRESSED_IMAGE else "joint_topic"
     return (
         f"{path} has no {message_type} on {topic}; it has {', '.join(there) or 'no topics'}; "

@@ -115,7 +115,7 @@ def walk(file: BinaryIO) -> Iterator[Record | Break]:
     """
     size = os.fstat(file.fileno()).st_size
     whole = _ends_with_magic(file, size)
-    summary = _summary(file, size) if whole else b""
+    summary = _summary(file, size) if whole else None
     marks = _chunk_starts(summary, size)
     offset = len(MAGIC)
     while True:
@@ -136,7 +136,7 @@ def walk(file: BinaryIO) -> Iterator[Record | Break]:
             return
         offset = end
         if opcode == DATA_END and summary is None:
-            yield Break(offset, cut=False, resumed_at=None)
+            yield Break(offset, cut=not whole, resumed_at=None)
             return
 
 

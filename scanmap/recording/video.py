@@ -12,13 +12,13 @@ import numpy as np
 from scanmap.errors import ConfigError, RecordingError
 from scanmap.recording.bearings import Row, frame_number, read_bearings
 from scanmap.recording.source import Report, Source, text_beside
-from scanmap.shot import Shot, encode_png
+from scanmap.shot import Image, Shot, encode_png, image_format
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
 
 
 def video_source(path: Path, bearings: Path | None = None) -> Source:
-    """Open a video; its decoded frames become lossless PNG.
+    """Open a video; the JPEGs of a motion JPEG stay as they are, all other frames become lossless PNG.
 
     The csv has the columns `frame,bearing_deg[,time_s]` with frame numbers from 0 (frames it does not name are
     passed over), or only bearings, one a frame. Times default to those of the video.
@@ -68,10 +68,17 @@ def _by_frame(table: Path, rows: list[Row]) -> dict[int, Row]:
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
+    """The video; one that is a row of JPEGs hands out those as they are, any other its decoded frames."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise RecordingError(f"video {path} cannot be opened: no video, damaged, or a codec that OpenCV lacks")
-    return capture
+    if int(capture.get(cv2.CAP_PROP_FOURCC)) != cv2.VideoWriter.fourcc(*"MJPG"):
+        return capture
+    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    if not packets.isOpened():
+        return capture
+    capture.release()
+    return packets
 
 
 def _read(path: Path, table: Path, rows: dict[int, Row], report: Report) -> Iterator[Shot]:
@@ -85,7 +92,7 @@ def _read(path: Path, table: Path, rows: dict[int, Row], report: Report) -> Iter
                 ok, pixels = capture.retrieve()
                 if ok:
                     time = number / rate if math.isnan(row.time) else row.time
-                    yield Shot(index, row.bearing, row.bearing, time, encode_png(np.asarray(pixels, np.uint8)))
+                    yield Shot(index, row.bearing, row.bearing, time, _encoded(np.asarray(pixels, np.uint8)))
                 else:
                     report(f"{path}: frame {number} cannot be decoded and is left out")
                 index += 1
@@ -97,3 +104,9 @@ def _read(path: Path, table: Path, rows: dict[int, Row], report: Report) -> Iter
         raise RecordingError(f"none of the {len(rows)} frames that {table} names is in {path}, which has {number}")
     if beyond:
         report(f"{path} has {number} frames; {beyond} frames that {table.name} names are not in it")
+
+
+def _encoded(frame: Image) -> bytes:
+    """A JPEG packet (1, N) as it is, a decoded frame as PNG."""
+    packet = bytes(frame) if frame.shape[0] == 1 else b""
+    return packet if image_format(packet) == "jpeg" else encode_png(frame)
