@@ -42,6 +42,7 @@ THESIS_ORIGINAL = "thesis/original"
 THESIS_GREY = "thesis/grey"
 THESIS_BINARY = "thesis/binary"
 THESIS_OVERLAY = "thesis/overlay"
+THESIS_PICTURES = (THESIS_ORIGINAL, THESIS_GREY, THESIS_BINARY, THESIS_OVERLAY)
 THESIS_PPX = "thesis/plots/ppx"
 THESIS_P = "thesis/plots/p"
 THESIS_DISTANCE = "thesis/plots/distance"

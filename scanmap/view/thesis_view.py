@@ -99,7 +99,7 @@ class ThesisView:
 
         log = self._recording.log
         v, width = (self._row + 0.5) / self._shrink, self._calibration.intrinsics.width / self._shrink
-        for path in (at.THESIS_ORIGINAL, at.THESIS_GREY, at.THESIS_BINARY, at.THESIS_OVERLAY):
+        for path in at.THESIS_PICTURES:
             strip = rr.LineStrips2D([[[0.0, v], [width, v]]], colors=ROW_COLOUR, radii=-0.75)
             log(f"{path}/row", strip, static=True)
         log(at.THESIS_PPX, rr.SeriesLines(names=f"ppx of row {self._row} [px]", colors=(255, 90, 90)), static=True)
