@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from scanmap.errors import CameraError, ConfigError, StageError
 from scanmap.rig import Frame, Rig
+from scanmap.rig.manual import ManualStage
 from scanmap.rig.stage import StageParams, open_stage
-from scanmap.sweep import SweepParams, plan, sweep
+from scanmap.sweep import SweepParams, between, plan, sweep
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import plug
 
@@ -28,14 +29,19 @@ class FakeCamera:
         self.fail_at: set[int] = set()
         self.grabs = 0
         self.closed = False
+        self.latency_s = 0.0
+        self.jitter = np.random.default_rng(1)
 
     def grab(self) -> Frame:
         self.grabs += 1
         if self.grabs in self.fail_at:
             raise CameraError("truncated frame")
-        self.firmware.wait(0.05)
+        self.firmware.wait(0.033)
         laser = "on" if self.firmware.laser_on else "off"
-        return Frame(f"{math.degrees(self.firmware.bearing):.4f} {laser}".encode(), self.firmware.now)
+        image = f"{math.degrees(self.firmware.bearing):.4f} {laser}".encode()
+        if self.latency_s:
+            self.firmware.wait(self.latency_s + self.jitter.normal(0.0, 0.002))
+        return Frame(image, self.firmware.now)
 
     def close(self) -> None:
         self.closed = True
@@ -163,3 +169,99 @@ def test_an_unplugged_stage_is_one_clear_error_and_every_shot_before_it_counts(r
     with pytest.raises(StageError, match=r"twin://head is gone .*plug the board in"):
         next(shots)
     assert len(seen) == 5
+
+
+def test_continuous_sweep_knows_the_bearing_of_every_exposure_in_both_directions(rig: Rig, firmware: Firmware) -> None:
+    rig.camera.latency_s = 0.08  # type: ignore[attr-defined]
+    params = SweepParams(
+        mode="continuous", speed_deg_s=6, latency_s=0.08, step_deg=0.5, end_deg=60, passes="forward-backward"
+    )
+    shots = list(sweep(rig, params, sleep=firmware.wait, clock=lambda: firmware.now))
+    errors = np.array([math.degrees(shot.bearing) - picture(shot.image)[0] for shot in shots])
+    assert len(shots) > 80
+    assert {picture(shot.image)[1] for shot in shots} == {"on"}
+    assert np.abs(errors).max() < 6 * 0.008 + 1 / 80  # four sigma of the jitter, one step
+    assert abs(errors.mean()) < 0.004
+    assert [shot.index for shot in shots] == list(range(len(shots)))
+    assert not firmware.laser_on
+    assert firmware.bearing == 0.0
+
+
+def test_latency_left_out_shows_as_opposite_shifts_of_the_two_passes(rig: Rig, firmware: Firmware) -> None:
+    rig.camera.latency_s = 0.08  # type: ignore[attr-defined]
+    params = SweepParams(mode="continuous", step_deg=0.5, end_deg=60, passes=2)
+    shots = list(sweep(rig, params, sleep=firmware.wait, clock=lambda: firmware.now))
+    errors = np.array([math.degrees(shot.bearing) - picture(shot.image)[0] for shot in shots])
+    bearings = [shot.bearing for shot in shots]
+    half = int(np.argmax(np.diff(bearings) < 0))
+    assert errors[5 : half - 5].mean() == pytest.approx(6 * 0.08, abs=0.02)
+    assert errors[half + 5 : -5].mean() == pytest.approx(-6 * 0.08, abs=0.02)
+
+
+def test_continuous_sweep_left_in_the_middle_stops_at_once(rig: Rig, firmware: Firmware) -> None:
+    shots = sweep(rig, SweepParams(mode="continuous", park=False), sleep=firmware.wait, clock=lambda: firmware.now)
+    for _ in range(20):
+        next(shots)
+    here = math.degrees(firmware.bearing)
+    shots.close()  # type: ignore[attr-defined]
+    assert not firmware.laser_on
+    assert firmware.state == "Idle"
+    assert here <= math.degrees(firmware.bearing) < here + 0.5
+    assert rig.stage.where() == pytest.approx(firmware.bearing)
+
+
+def test_continuous_faster_than_the_stage_is_refused(rig: Rig) -> None:
+    with pytest.raises(StageError, match=r"exceeds stage\.speed_deg_s = 20"):
+        next(sweep(rig, SweepParams(mode="continuous", speed_deg_s=30)))
+
+
+def test_continuous_needs_a_motor() -> None:
+    stage = ManualStage(StageParams(kind="manual"), input)
+    rig = Rig(FakeCamera(Firmware()), stage, "hand")
+    with pytest.raises(ConfigError, match="needs a stage of kind grbl"):
+        sweep(rig, SweepParams(mode="continuous"))
+
+
+def test_adaptive_sweep_visits_what_the_picture_asks_for(rig: Rig, firmware: Firmware) -> None:
+    coarse = plan(SweepParams(step_deg=10)).bearings
+    asked: list[int] = []
+
+    def refine() -> np.ndarray:
+        gaps = np.zeros(18, bool)
+        gaps[[3, 4]] = True
+        asked.append(1)
+        return between(coarse, gaps, 2.5)
+
+    params = SweepParams(step_deg=10, mode="adaptive")
+    shots = list(sweep(rig, params, sleep=firmware.wait, refine=refine))
+    fine = [math.degrees(shot.bearing) for shot in shots[19:]]
+    assert fine == pytest.approx([47.5, 45, 42.5, 37.5, 35, 32.5], abs=1 / 80)
+    assert [shot.index for shot in shots] == list(range(25))
+    assert asked == [1]
+
+
+@given(n=st.integers(2, 40), fine=st.floats(0.05, 5), mask=st.integers(0, 2**39 - 1))
+def test_gaps_are_filled_evenly_and_only_where_asked(n: int, fine: float, mask: int) -> None:
+    coarse = np.radians(np.linspace(0, 90, n))
+    gaps = np.array([bool(mask >> k & 1) for k in range(n - 1)])
+    joined = np.sort(np.concatenate([coarse, between(coarse, gaps, fine)]))
+    steps = np.degrees(np.diff(joined))
+    assert (steps > 1e-9).all()
+    left = np.searchsorted(coarse, joined[:-1] + 1e-9) - 1
+    assert (steps[gaps[left]] <= fine + 1e-9).all()
+    np.testing.assert_allclose(steps[~gaps[left]], 90 / (n - 1))
+
+
+def test_a_sweep_can_begin_where_another_ended(rig: Rig, firmware: Firmware) -> None:
+    shots = list(sweep(rig, SweepParams(step_deg=10), sleep=firmware.wait, first=15))
+    assert [shot.index for shot in shots] == [15, 16, 17, 18]
+    assert shots[0].bearing_commanded == pytest.approx(math.radians(150))
+
+
+def test_a_plan_says_what_it_is() -> None:
+    planned = plan(SweepParams(off_frames=True))
+    assert planned.words.startswith("181 bearings from 0 to 180 deg every 1 deg, forward, laser on and off; about 1:12")
+    assert planned.as_metadata()["shots"] == "181"
+    assert set(map(type, planned.as_metadata().values())) == {str}
+    with pytest.raises(ConfigError, match=r"sweep\.passes = 0"):
+        plan(SweepParams(passes=0))

@@ -14,6 +14,7 @@ from scanmap.errors import StageError
 from scanmap.rig import grbl_protocol as protocol
 from scanmap.rig.grbl_link import GrblLink
 from scanmap.rig.grbl_protocol import Dialect, Status
+from scanmap.rig.grbl_settings import fit_settings, idle_setting_afterwards
 from scanmap.rig.serial_port import open_serial, serial_devices
 from scanmap.rig.stage import StageParams, check_limits
 
@@ -21,8 +22,6 @@ __all__ = ["GrblStage", "StageParams", "open_grbl"]
 
 BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
 HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
-HOLD_FOREVER = 255.0  # $1: the motor holds between moves
-IDLE_MS_DEFAULT = 25.0  # $1 of a fresh board
 REPORT_DEG = 0.001  # resolution of a status report
 STEP_DEG_UNKNOWN = 0.1  # how far off an arrival may be where the board does not tell its steps
 FAREWELL_S = 0.5  # how long the last reset may take to be confirmed
@@ -79,6 +78,22 @@ class GrblStage:
             self._from_below = True
         return math.radians(self._go(target))
 
+    def start_turn(self, bearing: float, speed: float) -> None:
+        """Begin to turn to `bearing` [rad] at `speed` [rad/s] and return at once; `move_to` then arrives.
+
+        Raises:
+            StageError: outside the limits, or refused.
+        """
+        target = math.degrees(bearing)
+        check_limits(target, self._params)
+        if math.degrees(speed) > self._params.speed_deg_s * (1 + 1e-9):
+            raise StageError(
+                f"a turn at {math.degrees(speed):g} deg/s exceeds stage.speed_deg_s = {self._params.speed_deg_s:g}: "
+                "turn slower (sweep.speed_deg_s), or raise the stage's"
+            )
+        self._link.in_motion = True
+        self._link.command(f"G53 G1 X{self._x_of(target):.4f} F{math.degrees(speed) * 60:.1f}")
+
     def where(self) -> float:
         """The bearing reported now [rad]."""
         return math.radians(self._where_deg())
@@ -90,6 +105,8 @@ class GrblStage:
             StageError: no answer, or refused.
         """
         if self.laser_switchable:
+            if not on and self._link.in_motion:
+                self._link.stop()  # M5 would wait for the end of the way
             self._link.command(f"M3 S{self._params.laser_s:g}" if on else "M5", despite_fault=not on)
 
     def home(self) -> float:
@@ -119,6 +136,8 @@ class GrblStage:
             return
         self._closed = True
         try:
+            if self._link.in_motion:
+                self._link.stop()
             if self.laser_switchable:
                 self._link.command("M5", despite_fault=True)
             self._release_motor()
@@ -136,11 +155,7 @@ class GrblStage:
         if self._status().state == "Alarm" and self._params.homing != "switch":
             self._unlock()
         self._link.fault = None
-        if self.dialect.has_numbered_settings:
-            self._settings = dict(filter(None, map(protocol.parse_setting, self._link.command("$$"))))
-            self._write_settings()
-        else:
-            self._check_yaml()
+        self._settings = fit_settings(self._link, self.dialect, self._params)
         # G1 as the standing mode: a board in laser mode lights a standing laser only then.
         self._link.preamble = [f"G21 G90 G94 G1 F{self._params.speed_deg_s * 60:.1f}"]
         if self._params.homing == "hand":
@@ -149,45 +164,6 @@ class GrblStage:
         else:
             self.home()
         self.laser(False)
-
-    def _write_settings(self) -> None:
-        """Bring the board's settings to the rig's, writing only what differs: its memory wears out."""
-        params = self._params
-        wanted = {"100": params.steps_per_deg, "120": params.acceleration_deg_s2, "1": HOLD_FOREVER}
-        feed = params.speed_deg_s * 60
-        if self._settings.get("110", feed) < feed:
-            wanted["110"] = feed
-        if self.laser_switchable:
-            wanted["32"] = 0.0
-        for number, value in wanted.items():
-            if value is None or math.isclose(self._settings.get(number, math.nan), value, abs_tol=6e-4):
-                continue
-            self._link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."))
-            if number != "1":
-                self._settings[number] = value
-
-    def _check_yaml(self) -> None:
-        """FluidNC keeps its machine in a file: compare, and say what to change there."""
-        steps = self._yaml_value("/axes/x/steps_per_mm")
-        wanted = self._params.steps_per_deg
-        if steps is not None:
-            self._settings["100"] = steps
-            if wanted is not None and not math.isclose(steps, wanted, rel_tol=1e-4):
-                raise StageError(
-                    f"stage {self._link.name}: axes/x/steps_per_mm is {steps:g} in the board's config.yaml, "
-                    f"stage.steps_per_deg is {wanted:g}: make them equal"
-                )
-        idle_ms = self._yaml_value("/stepping/idle_ms")
-        if idle_ms is not None and idle_ms != HOLD_FOREVER:
-            logger.warning("%s lets the motor go after %g ms: set stepping/idle_ms: 255", self._link.name, idle_ms)
-
-    def _yaml_value(self, path: str) -> float | None:
-        try:
-            answers = self._link.command(f"${path}")
-        except StageError:
-            return None
-        found = [setting for setting in map(protocol.parse_setting, answers) if setting and setting[0] == path]
-        return found[0][1] if found else None
 
     def _unlock(self) -> None:
         for attempt in range(2):
@@ -214,11 +190,12 @@ class GrblStage:
     def _go(self, target_deg: float) -> float:
         """Move, prove the arrival, and return the bearing reported [deg]."""
         params = self._params
-        x = self._zero_deg + params.direction * (target_deg - params.home_deg)
+        x = self._x_of(target_deg)
         here = math.nan
         for _ in range(2):  # a line damaged on its way can name another target
             self._link.command(f"G53 G1 X{x:.4f} F{params.speed_deg_s * 60:.1f}")
             self._link.command("G4 P0.01")  # answered only when all that was planned is done
+            self._link.in_motion = False
             here = self._where_deg()
             step = 1.0 / self._settings["100"] if self._settings.get("100") else STEP_DEG_UNKNOWN
             if abs(here - target_deg) <= step + REPORT_DEG:
@@ -227,6 +204,10 @@ class GrblStage:
             f"stage {self._link.name} was asked for {target_deg:g} deg and stands at {here:g}: check for a blocked "
             "head or a limit switch, then `scanmap stage home`"
         )
+
+    def _x_of(self, bearing_deg: float) -> float:
+        """The board's X at a bearing."""
+        return self._zero_deg + self._params.direction * (bearing_deg - self._params.home_deg)
 
     def _where_deg(self) -> float:
         x = self._machine_deg(self._status())
@@ -257,10 +238,8 @@ class GrblStage:
         if not self.dialect.has_numbered_settings:
             self._link.command("$MD", despite_fault=True)
             return
-        before = self._settings.get("1", IDLE_MS_DEFAULT)
-        # 255 was left behind by a run that was killed. The reset that follows lets the motor go.
-        idle_ms = IDLE_MS_DEFAULT if before == HOLD_FOREVER else before
-        self._link.command(f"$1={idle_ms:g}", despite_fault=True)
+        # The reset that follows lets the motor go.
+        self._link.command(f"$1={idle_setting_afterwards(self._settings):g}", despite_fault=True)
 
 
 def open_grbl(params: StageParams) -> GrblStage:

@@ -16,6 +16,7 @@ from scanmap.rig.grbl_protocol import Banner, Status
 from scanmap.rig.serial_port import SerialPort
 
 POLL_S = 0.25  # `?` while waiting, or more often for a short time-out; grbl wants no more than 5 to 10 a second
+BRAKE_POLL_S = 0.05
 ATTEMPTS = 3
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
 
@@ -30,6 +31,7 @@ class GrblLink:
         self._timeout_s = timeout_s
         self._poll_s = min(POLL_S, timeout_s / 4)
         self._answered = True  # False while a line is out; stays so if the caller was interrupted
+        self.in_motion = False  # True between the start of a turn and its arrival
         self.preamble: list[str] = []  # sent after every reset that was asked for
         self.fault: str | None = None  # why commands are refused: position lost, alarm
 
@@ -97,6 +99,8 @@ class GrblLink:
             status = self.status()
             if status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate):
                 break
+            if line := self._port.read_line(BRAKE_POLL_S):
+                self._note(line)
         self.reset()
 
     def reset(self) -> Banner:
@@ -109,7 +113,7 @@ class GrblLink:
             self._port.write(protocol.RESET)
             banner = self.await_banner(self._timeout_s)
             if banner:
-                self._answered = True
+                self._answered, self.in_motion = True, False
                 for line in self.preamble if self.status().state != "Alarm" else []:
                     self.command(line)
                 return banner

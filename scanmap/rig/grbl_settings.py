@@ -1,0 +1,80 @@
+"""Bring a GRBL board's machine settings to what the rig's configuration says."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from scanmap.errors import StageError
+from scanmap.rig.grbl_link import GrblLink
+from scanmap.rig.grbl_protocol import Dialect, parse_setting
+from scanmap.rig.stage import StageParams
+
+HOLD_FOREVER = 255.0  # $1: the motor holds between moves
+IDLE_MS_DEFAULT = 25.0  # $1 of a fresh board
+
+logger = logging.getLogger(__name__)
+
+
+def fit_settings(link: GrblLink, dialect: Dialect, params: StageParams) -> dict[str, float]:
+    """Read the board's settings and change those that do not fit; returns them by number.
+
+    `"1"` in the result is what it was before: the caller puts it back at the end.
+
+    Raises:
+        StageError: refused, or FluidNC's file says otherwise than `params`.
+    """
+    if dialect.has_numbered_settings:
+        return _fit_numbered(link, params)
+    return _compare_yaml(link, params)
+
+
+def idle_setting_afterwards(settings: dict[str, float]) -> float:
+    """`$1` [ms] with which to leave the board, so that its motor is free."""
+    before = settings.get("1", IDLE_MS_DEFAULT)
+    return IDLE_MS_DEFAULT if before == HOLD_FOREVER else before  # 255 was left behind by a run that was killed
+
+
+def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
+    """Write only what differs: the board's memory wears out."""
+    settings = dict(filter(None, map(parse_setting, link.command("$$"))))
+    wanted = {"100": params.steps_per_deg, "120": params.acceleration_deg_s2, "1": HOLD_FOREVER}
+    feed = params.speed_deg_s * 60
+    if settings.get("110", feed) < feed:
+        wanted["110"] = feed
+    if params.laser == "grbl":
+        wanted["32"] = 0.0
+    for number, value in wanted.items():
+        if value is None or math.isclose(settings.get(number, math.nan), value, abs_tol=6e-4):
+            continue
+        link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."))
+        if number != "1":
+            settings[number] = value
+    return settings
+
+
+def _compare_yaml(link: GrblLink, params: StageParams) -> dict[str, float]:
+    """FluidNC keeps its machine in a file: compare, and say what to change there."""
+    settings = {}
+    steps = _yaml_value(link, "/axes/x/steps_per_mm")
+    wanted = params.steps_per_deg
+    if steps is not None:
+        settings["100"] = steps
+        if wanted is not None and not math.isclose(steps, wanted, rel_tol=1e-4):
+            raise StageError(
+                f"stage {link.name}: axes/x/steps_per_mm is {steps:g} in the board's config.yaml, "
+                f"stage.steps_per_deg is {wanted:g}: make them equal"
+            )
+    idle_ms = _yaml_value(link, "/stepping/idle_ms")
+    if idle_ms is not None and idle_ms != HOLD_FOREVER:
+        logger.warning("%s lets the motor go after %g ms: set stepping/idle_ms: 255", link.name, idle_ms)
+    return settings
+
+
+def _yaml_value(link: GrblLink, path: str) -> float | None:
+    try:
+        answers = link.command(f"${path}")
+    except StageError:
+        return None
+    found = [setting for setting in map(parse_setting, answers) if setting and setting[0] == path]
+    return found[0][1] if found else None
