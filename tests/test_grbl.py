@@ -6,6 +6,8 @@ import gc
 import math
 import os
 import random
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -61,7 +63,7 @@ def url(request: pytest.FixtureRequest, board: Firmware, monkeypatch: pytest.Mon
 
 @pytest.fixture
 def stage(url: str) -> Iterator[GrblStage]:
-    stage = open_grbl(StageParams(port=url, steps_per_deg=80.0, timeout_s=1.0))
+    stage = open_grbl(StageParams(port=url, steps_per_deg=80.0, timeout_s=1.0, watchdog=False))
     yield stage
     stage.close()
 
@@ -108,11 +110,11 @@ def test_after_close_the_laser_is_off_and_the_motor_free(stage: Stage, board: Fi
 
 
 def test_a_second_start_finds_a_board_that_a_killed_one_left_shining(url: str, board: Firmware) -> None:
-    first = open_grbl(StageParams(port=url, timeout_s=1.0))
+    first = open_grbl(StageParams(port=url, timeout_s=1.0, watchdog=False))
     first.move_to(1.0)
     first.laser(True)
     first._link.close()  # kill -9: no goodbye
-    with_laser = open_grbl(StageParams(port=url, timeout_s=1.0))
+    with_laser = open_grbl(StageParams(port=url, timeout_s=1.0, watchdog=False))
     assert not board.laser_on
     with_laser.close()
     if board.dialect == "grbl":
@@ -120,7 +122,7 @@ def test_a_second_start_finds_a_board_that_a_killed_one_left_shining(url: str, b
 
 
 def test_settings_are_written_once(url: str, board: Firmware) -> None:
-    params = StageParams(port=url, steps_per_deg=80.0, acceleration_deg_s2=200.0, timeout_s=1.0)
+    params = StageParams(port=url, steps_per_deg=80.0, acceleration_deg_s2=200.0, timeout_s=1.0, watchdog=False)
     if board.dialect == "FluidNC":
         pytest.skip("FluidNC has no numbered settings")
     open_grbl(params).close()
@@ -324,3 +326,38 @@ def test_noise_on_the_line_before_the_banner_does_no_harm(noise: bytes) -> None:
         stage = open_grbl(StageParams(port=url, timeout_s=0.3))
         assert stage.move_to(0.5) == pytest.approx(board.bearing)
         stage.close()
+
+
+KILLED = """
+import os, signal, sys
+from scanmap.rig import grbl
+from scanmap.rig.stage import StageParams
+grbl.BOOT_S = 0.2
+stage = grbl.open_grbl(StageParams(port=sys.argv[1]))
+stage.laser(True)
+stage.start_turn(3.0, 0.1)
+print("shining", flush=True)
+sys.stdin.readline()
+stage.close() if sys.argv[2] == "close" else os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a pty")
+@pytest.mark.parametrize("end", ["close", "kill"])
+def test_after_kill_9_the_watchdog_puts_the_laser_out(end: str) -> None:
+    board = Firmware(instant=False, resets_on_open=False)
+    with pty_port(board) as url:
+        command = [sys.executable, "-c", KILLED, url, end]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as program:
+            assert program.stdin is not None
+            assert program.stdout is not None
+            assert program.stdout.readline() == b"shining\n"
+            assert board.laser_on
+            assert board.state == "Run"
+            program.stdin.write(b"\n")
+        assert program.returncode == (0 if end == "close" else -9)
+        deadline = time.monotonic() + 10.0
+        while board.laser_on and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not board.laser_on
+        assert board.state == "Idle"  # braked first: the position is kept

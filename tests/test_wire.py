@@ -172,6 +172,27 @@ def test_lost_ok_is_noticed_by_an_idle_board_and_the_line_sent_again() -> None:
     finish(port)
 
 
+def test_a_hold_nobody_asked_for_is_released_once_then_said() -> None:
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    held = at(4, "Hold:0")
+    stage, port = play([*OPEN_GRBL, (line, b""), (b"?", held), (b"~", OK), *move(10)[1:]])
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+    stage, port = play([*OPEN_GRBL, (line, b""), (b"?", held), (b"~", b""), (b"?", held)])
+    with pytest.raises(StageError, match="is on hold: release its hold button"):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_a_running_board_that_stands_still_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scanmap.rig.grbl_link.STILL_S", 0.01)
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    stage, port = play([*OPEN_GRBL, (line, OK), (b"G4 P0.01\n", b""), (b"?", at(4, "Run")), (b"?", at(4, "Run"))])
+    with pytest.raises(StageError, match="runs but stands at 4: check the motor"):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
 def test_lost_status_is_asked_for_again() -> None:
     stage, port = play([*OPEN_GRBL, (b"?", b""), (b"?", b"<Idle|MPos:garb\r\n" + at(3))], timeout_s=1.0)
     assert stage.where() == pytest.approx(math.radians(3))

@@ -17,6 +17,7 @@ from scanmap.rig.grbl_protocol import Dialect, Status
 from scanmap.rig.grbl_settings import fit_settings, idle_setting_afterwards
 from scanmap.rig.serial_port import open_serial, serial_devices
 from scanmap.rig.stage import StageParams, check_limits
+from scanmap.rig.watchdog import Watchdog
 
 __all__ = ["GrblStage", "StageParams", "open_grbl"]
 
@@ -46,6 +47,7 @@ class GrblStage:
         self._work_offset: tuple[float, ...] | None = None
         self._from_below = False  # whether the last arrival took up the play
         self._closed = False
+        self._watchdog: Watchdog | None = None
         self._prepare()
 
     @property
@@ -77,6 +79,10 @@ class GrblStage:
                 self._go(target - self._params.backlash_deg)
             self._from_below = True
         return math.radians(self._go(target))
+
+    def watch_over(self, watchdog: Watchdog) -> None:
+        """Keep a watchdog until `close`."""
+        self._watchdog = watchdog
 
     def start_turn(self, bearing: float, speed: float) -> None:
         """Begin to turn to `bearing` [rad] at `speed` [rad/s] and return at once; `move_to` then arrives.
@@ -150,6 +156,8 @@ class GrblStage:
             except StageError:
                 logger.warning("%s is gone: switch the laser off by hand", self._link.name)
             self._link.close()
+            if self._watchdog:
+                self._watchdog.dismiss()
 
     def _prepare(self) -> None:
         if self._status().state == "Alarm" and self._params.homing != "switch":
@@ -271,7 +279,10 @@ def _open_port(url: str, params: StageParams) -> GrblStage:
         if banner.dialect is Dialect.GRBL and banner.version.startswith("0."):
             raise StageError(f"{url} runs grbl {banner.version}: flash grbl 1.1 or newer")
         dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
-        return GrblStage(link, dialect, params)
+        stage = GrblStage(link, dialect, params)
+        if params.watchdog and stage.laser_switchable and not url.startswith("twin://"):
+            stage.watch_over(Watchdog(url, params.baud))
+        return stage
     except BaseException:
         with contextlib.suppress(StageError):
             link.send_reset()  # it may be homing

@@ -56,6 +56,9 @@ class StageParams(BaseModel, frozen=True, extra="forbid"):
         "grbl", description="grbl (M3/M5 of the board), always-on (on batteries: software cannot switch it)"
     )
     laser_s: float = Field(1000.0, ge=0.0, le=1e6, description="S word sent with M3; $30 is full power [board's units]")
+    watchdog: bool = Field(
+        True, description="keep a small process that switches the laser off should this program be killed"
+    )
     command_move: str = Field(
         "G1 X{deg:.3f} F{feed:.0f}",
         description="template: sent to turn; {deg}, {rad}, {feed} (deg/min), {us} (servo pulse, 500 to 2500 us)",
