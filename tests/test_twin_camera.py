@@ -159,28 +159,40 @@ def test_speckle_has_the_contrast_asked_for() -> None:
 
 
 def test_glare_surrounds_the_line_with_its_share_of_the_light() -> None:
-    dark = BOX.model_copy(
-        update={"light": LightParams(ambient=0.0), "laser": LaserParams(speckle=0, white_wall_peak=60)}
-    )
-    none, some = (
-        pixels(shoot(with_sensor(dark, glare=g, glare_px=8.0), head(), (0.0, True))[0])[250:350, :, 2]
-        for g in (0.0, 0.02)
-    )
-    column = round(float(np.mean(np.nonzero(none)[1])))
-    ring = some[:, column + 12].mean()
-    assert none[:, column + 12].mean() == 0.0
-    # The line's own width adds little: its flux, spread over a Gaussian of 8 px.
-    sigma = np.hypot(0.6, 632.7 * np.hypot(0.0005, 0.002) / 2.0)
-    flux = 60.0 * np.sqrt(2 * np.pi) * np.hypot(sigma, 12**-0.5)
-    expected = 255 * 0.02 * flux / (8.0 * np.sqrt(2 * np.pi)) * np.exp(-0.5 * (12 / 8.0) ** 2)
-    assert ring == pytest.approx(expected, rel=0.1)
+    def red(peak: float, glare: float) -> NDArray[np.float64]:
+        laser = LaserParams(speckle=0.0, white_wall_peak=peak)
+        dark = BOX.model_copy(update={"light": LightParams(ambient=0.0), "laser": laser})
+        return pixels(shoot(with_sensor(dark, glare=glare, glare_px=8.0), head(), (0.0, True))[0])[250:350, :, 2]
+
+    plain = red(0.6, 0.0)
+    column = round(float(np.average(np.arange(800), weights=plain.sum(axis=0))))
+    beside = [column - 12, column + 12]
+    assert red(60.0, 0.0)[:, beside].max() == 0.0
+    # The line is narrow against the glare: its light per row, spread over a Gaussian of 8 px.
+    flux = 100.0 * plain.sum(axis=1).mean()
+    expected = 0.02 * flux / (8.0 * np.sqrt(2 * np.pi)) * np.exp(-0.5 * (12 / 8.0) ** 2)
+    assert red(60.0, 0.02)[:, beside].mean() == pytest.approx(expected, rel=0.06)
 
 
-def test_red_filter_leaves_red() -> None:
-    plain, red = (
-        pixels(shoot(with_sensor(BOX, red_filter=f), head(), (0.3, False))[0]).mean(axis=(0, 1)) for f in (0, 1)
-    )
-    np.testing.assert_allclose(red / plain, [0.05, 0.05, 0.92], atol=0.03)
+def test_red_filter_leaves_red_of_room_and_line() -> None:
+    green = BOX.model_copy(update={"laser": LaserParams(speckle=0.0, colour="green")})
+    for laser_on, channels in ((False, [0, 1, 2]), (True, [1])):
+        plain, red = (
+            pixels(shoot(with_sensor(green, red_filter=f), head(), (0.3, laser_on))[0]) for f in (False, True)
+        )
+        ratio = red.max(axis=(0, 1)) / plain.max(axis=(0, 1))
+        np.testing.assert_allclose(ratio[channels], np.array([0.05, 0.05, 0.92])[channels], atol=0.05)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_levels_are_rounded_not_cut_off(noise: bool) -> None:
+    levels = np.array([0.0, 0.4, 0.6, 100.4, 100.6, 254.6, 300.0])
+    silent = CLEAN.model_copy(update={"noise": noise, "full_well_e": 1e12, "read_noise_dn": 0.0})
+    sensor = Sensor(silent, len(levels), 1, np.random.default_rng(0))
+    coded = np.repeat(np.rint(levels * STEPS).astype(np.int16)[None, :, None], 3, axis=2)
+    shown = decode_image(sensor.read_out(coded, sensor.noise_amplitude(coded))).image[0, :, 0]
+    assert shown.tolist() == [0, 0, 1, 100, 101, 255, 255]
+    np.testing.assert_allclose(sensor.code(sensor.light(coded)), coded, atol=1)
 
 
 def test_distortion_bends_the_room_as_opencv_does() -> None:

@@ -13,7 +13,7 @@ from scanmap.calibration import Calibration, CalibrationFile, HeadTable, ImageTa
 from scanmap.geometry import HeadMount
 from scanmap.twin import LaserParams, LightParams, RoomParams, build_scene
 from scanmap.twin.laser import LaserFan
-from scanmap.twin.mesh import Mesh, quad
+from scanmap.twin.mesh import Mesh, merged, quad
 from scanmap.twin.optics import Lens
 from scanmap.twin.room import Thing, assembled
 from scanmap.twin.scene import Scene
@@ -159,6 +159,29 @@ def test_slanted_and_grazing_lines_match_brute_force(height: float) -> None:
     np.testing.assert_allclose(centre[0], centre[1], atol=1.0)
 
 
+@pytest.mark.parametrize("height", [-1.0, -0.12, -0.03])
+def test_blur_of_slanted_lines_is_blur_of_the_picture(height: float) -> None:
+    scene = scene_of(quad([0.3, -1.0, height], [4.0, 0, 0], [0, 2.0, 0]))
+    sharp, blurred = (picture(LaserFan(scene, thesis_head(), LaserParams(), b), 0.0) for b in (0.4, np.hypot(0.4, 1.5)))
+    # `white_wall_peak` makes up for the blur on the wall it is defined by: compare shapes.
+    expected = cv2.GaussianBlur(sharp, (0, 0), 1.5)
+    gain = blurred.sum() / expected.sum()
+    strong = expected > 0.3 * expected.max()
+    assert strong.sum() > 300
+    np.testing.assert_allclose(np.median(blurred[strong] / expected[strong]), gain, rtol=0.02)
+    assert np.mean(np.abs(blurred[strong] / expected[strong] / gain - 1.0) < 0.05) > 0.9
+
+
+def test_a_jump_in_depth_within_one_thing_cuts_the_line() -> None:
+    plate = quad([1.5, -0.6, -0.2], [0, 0, 0.5], [0, 1.2, 0])
+    wall = quad([3.0, -2.0, -1.0], [0, 0, 3.0], [0, 4.0, 0])
+    both = merged([plate, wall])
+    one, two = (
+        picture(LaserFan(scene_of(*m), thesis_head(), LaserParams(), 0.6), 0.0) for m in ([both], [plate, wall])
+    )
+    np.testing.assert_array_equal(one, two)
+
+
 def test_brightness_follows_range_thickness_and_incidence() -> None:
     head, laser = thesis_head(), LaserParams(white_wall_peak=0.9)
 
@@ -213,14 +236,15 @@ def test_what_the_camera_cannot_see_is_dark() -> None:
 
 def test_a_surface_lit_from_behind_is_not_seen() -> None:
     head = thesis_head()
-    # Both sides exist; this one faces the camera's side at such a slant that the laser meets its back.
-    sliver = quad([1.0, -0.02, -0.5], [0, 0, 1.0], [0.5, 0.03, 0])
+    # So slanted that its plane passes between laser and camera.
+    sliver = quad([1.0, 0.01, -0.5], [0, 0, 1.0], [0.5, -0.02, 0])
     line = LaserFan(scene_of(sliver), head, LaserParams(), 0.6).trace(0.0)
     side = np.einsum("ij,ij->i", line.normal, -line.points) * np.einsum(
         "ij,ij->i", line.normal, head.T_head_camera[:3, 3] - line.points
     )
     assert len(line.points) > 100
-    assert not line.seen[side < 0].any()
+    assert (side < 0).all()
+    assert not line.seen.any()
 
 
 def test_colour_of_laser_and_surface_multiply() -> None:
