@@ -70,6 +70,9 @@ def polar_evidence(scan: Scan, floor: Floor, params: GridParams) -> PolarEvidenc
     A row that returns from within the band is a hit there. Every returning row, floor and ceiling rows too,
     has passed the band up to where it hit or left it. A row without a return says nothing.
     """
+    if not scan.valid.any():
+        none = np.zeros(0)
+        return PolarEvidence(none, np.zeros((0, 2)), none, none, none, none, np.zeros(0, np.intp), none, none)
     T = floor.T_level_world
     origins = scan.origins
     laser = transform(T, origins)
@@ -78,7 +81,7 @@ def polar_evidence(scan: Scan, floor: Floor, params: GridParams) -> PolarEvidenc
     delta[~scan.valid] = np.nan
     along, side, rise = _in_fan(delta, T, heading)
     height = rise + laser[:, 2:].astype(np.float32)
-    bins = int(np.nanmax(along, initial=0.0) / _width(params)) + 2
+    bins = int(np.nanmax(along, initial=0.0) / _width(params)) + 2 + 2 * BINS_PER_CELL  # room for the filters
     hits = _hits(height, along, side, _spread(scan), bins, params)
     free_from, free_to = _free(rise, along, laser[:, 2], bins, params)
     order = np.argsort(heading, kind="stable")
@@ -178,8 +181,12 @@ def _hits(height: F32, along: F32, side: F32, spread: float, bins: int, params: 
             np.where(weight > 0, weight * mean[each, peak], 0.0).sum(axis=1) / weight.sum(axis=1)
             for mean in (mean_range, mean_side)
         )
-    bearing, k = np.nonzero(hit)
-    return _Hits(bearing, mean_range[bearing, k], mean_side[bearing, k], surface, surface_side)
+    # Between two rows that graze one surface, a table top, there is no other surface and nothing free.
+    closed = cv2.morphologyEx(hit.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 2 * BINS_PER_CELL + 1), np.uint8))
+    bearing, k = np.nonzero(closed)
+    last = np.maximum.accumulate(np.where(hit, np.arange(bins), 0), axis=1)[bearing, k]
+    range_m = np.where(last == k, mean_range[bearing, k], (k + 0.5) * _width(params))
+    return _Hits(bearing, range_m, mean_side[bearing, last], surface, surface_side)
 
 
 def _strongest(count: F32, spread: float, width: float) -> F32:

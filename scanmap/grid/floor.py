@@ -73,16 +73,18 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
         max_tilt_deg: largest tilt of the axis against the floor's normal that is looked for.
     """
     points, sigma, level = _candidates(scan)
-    low = points[:, 2] < -0.02
-    seed = _lowest_layer(points[level & low], np.radians(max_tilt_deg))
-    if seed is not None:
-        slope, inliers, rms = _refine(points[level & low], sigma[level & low], seed)
+    low = level & (points[:, 2] < -0.02)
+    if low.sum() >= _MIN_SUPPORT:
+        # Floor, table and shelf are parallel: the strongest layer tells the tilt, the lowest strong one is the floor.
+        seed = _strongest_layer(points[low], np.radians(max_tilt_deg))
+        seed[2] = _lowest_layer(points[low], _refine(points[low], sigma[low], seed)[0])
+        slope, inliers, rms = _refine(points[low], sigma[low], seed)
         steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
         if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep:
             return Floor(_plane(slope), rms, inliers, "fitted")
     if laser_height_m is not None:
         return Floor(np.array([0.0, 0.0, 1.0, laser_height_m]), np.nan, 0, "given")
-    lowest = float(np.percentile(points[:, 2], 1.0)) if len(points) else 0.0
+    lowest = float(np.percentile(points[:, 2], 0.1)) if len(points) else 0.0
     return Floor(np.array([0.0, 0.0, 1.0, -lowest]), np.nan, int((points[:, 2] <= lowest).sum()), "lowest")
 
 
@@ -95,7 +97,8 @@ def _plane(slope: Array) -> Array:
 
 def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Thinned points (N, 3), their sigma (N,) and whether the surface there is nearly horizontal (N,)."""
-    across, down = max(1, len(scan) // 120), max(1, scan.rows // 150)
+    across = max(1, len(scan) // 120)
+    down = max(1, scan.rows // int(np.clip(18000 * across / max(len(scan), 1), 150, 600)))
     points = scan.points[::across, ::down].astype(np.float64)
     sigma = np.nan_to_num(scan.sigma_m[::across, ::down].astype(np.float64))
     origins = np.array([scan.mount.T_world_head(float(b))[:3, 3] for b in scan.bearings[::across]]).reshape(-1, 3)
@@ -105,33 +108,38 @@ def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
     # A short step says nothing about the slope where its ranges are noise.
     noise = 2.0 * np.maximum(sigma[:, 1:], sigma[:, :-1])
     flat = (np.abs(dz) < _HORIZONTAL_SLOPE * dr) & (dr > noise)
-    level[:, 1:] |= flat
-    level[:, :-1] |= flat
+    level[:, 1:-1] = flat[:, 1:] & flat[:, :-1]  # on both sides: the foot of a wall is not floor
     some = np.isfinite(points).all(axis=-1)
     return points[some], sigma[some], level[some]
 
 
-def _lowest_layer(points: Array, max_tilt: float) -> Array | None:
-    """z = a x + b y + c (3,) of the layer with most points in it and fewest below, coarsely; None without one."""
-    if len(points) < _MIN_SUPPORT:
-        return None
+def _strongest_layer(points: Array, max_tilt: float) -> Array:
+    """z = a x + b y + c (3,) of the layer of 10 cm that holds most points, over a grid of tilts."""
     points = points[:: max(1, len(points) // 3000)]
-    tilts = np.tan(np.linspace(-max_tilt, max_tilt, 9))
-    thick = 0.05
-    best, seed = -np.inf, None
-    for a in tilts:
-        for b in tilts:
-            height = points[:, 2] - a * points[:, 0] - b * points[:, 1]
-            bottom = height.min()
-            count = np.bincount(((height - bottom) / thick).astype(np.intp))
-            layer = np.convolve(count, [1, 1])[1:]  # two bins, so that no layer is cut in half
-            below = np.cumsum(count) - count
-            # Level wins between equals.
-            score = layer - 2.0 * below - 0.02 * len(points) * np.hypot(a, b) / max(np.tan(max_tilt), 1e-9)
-            k = int(score.argmax())
-            if score[k] > best:
-                best, seed = float(score[k]), np.array([a, b, bottom + (k + 1.0) * thick])
+    best, seed = -np.inf, np.zeros(3)
+    for a in np.tan(np.linspace(-max_tilt, max_tilt, 9)):
+        for b in np.tan(np.linspace(-max_tilt, max_tilt, 9)):
+            count, bottom = _layers(points[:, 2] - a * points[:, 0] - b * points[:, 1], 0.05)
+            k = int(count.argmax())
+            score = count[k] * (1.0 - 0.02 * np.hypot(a, b) / np.tan(max_tilt))  # between equals level wins
+            if score > best:
+                best, seed = score, np.array([a, b, bottom + 0.05 * k])
     return seed
+
+
+def _lowest_layer(points: Array, slope: Array) -> float:
+    """Height at the origin of the lowest layer parallel to `slope` with 4 % of the strongest one's points."""
+    count, bottom = _layers(points[:, 2] - points[:, :2] @ slope[:2], 0.03)
+    k = int((count >= max(0.04 * float(count.max()), _MIN_SUPPORT / 2)).argmax())
+    # The layer's strongest place, not its lower edge.
+    return bottom + 0.03 * (k + int(count[k : k + 3].argmax()))
+
+
+def _layers(height: Array, thick: float) -> tuple[NDArray[np.intp], float]:
+    """Points within `thick` of each of a row of heights that far apart, and the first of these heights."""
+    bottom = float(height.min())
+    count = np.bincount(((height - bottom) / thick).astype(np.intp))
+    return np.convolve(count, [1, 1]), bottom
 
 
 def _refine(points: Array, sigma: Array, slope: Array) -> tuple[Array, int, float]:
@@ -139,9 +147,9 @@ def _refine(points: Array, sigma: Array, slope: Array) -> tuple[Array, int, floa
     A = np.column_stack([points[:, :2], np.ones(len(points))])
     inlier = np.zeros(len(points), dtype=bool)
     residual: NDArray[Any] = points[:, 2] - A @ slope
-    for gate in (0.15, 0.08, 0.05, 0.03, 0.03):
+    for gate in (0.15, 0.08, 0.05, 0.03, 0.015, 0.015):
         # Height follows the ray's error by less than one; sigma as it is makes a generous gate.
-        inlier = np.abs(residual) < np.maximum(gate, 2.0 * np.minimum(sigma, 0.05))
+        inlier = np.abs(residual) < np.maximum(gate, 3.0 * np.minimum(sigma, 0.03))
         if inlier.sum() < 3:
             break
         weight = inlier / (sigma**2 + 0.003**2)

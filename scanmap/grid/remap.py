@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 _MIN_COS_INCIDENCE = np.cos(np.radians(85.0))
 # Neighbours this far apart in heading tell a wall's direction from the noise of its points [rad].
 _LINE_STEP = np.radians(1.0)
+# Bearings closer than this are the same one, repeated [rad].
+_SAME_HEADING = np.radians(0.02)
 # A cell's centre is nearer to a wall in the cell than this, in cells.
 _HALF_DIAGONAL = 0.71
 
@@ -33,6 +35,8 @@ class Beams(NamedTuple):
     direction: Array  # (B, 2) unit
     left: Array  # (B,) [rad] how far the beam reaches counter-clockwise: half way to the neighbour
     right: Array  # (B,)
+    next_left: NDArray[np.intp]  # (B,) the bearing next to it counter-clockwise
+    next_right: NDArray[np.intp]  # (B,)
     point: Array  # (B, 2) on the surface that most rows hit; NaN without
     tangent: Array  # (B, 2) along the wall; NaN where it is not straight
     blocks: NDArray[np.bool_]  # (B,) the free space ends at that surface, not for want of returns
@@ -44,6 +48,9 @@ def remap(evidence: PolarEvidence, params: GridParams) -> Counts:
     A bearing stands for half the step to both sides, at most max_beam_deg / 2. It hits along the direction
     of its wall where that is straight, so that walls stay in place and closed between coarse bearings.
     """
+    if not len(evidence.heading):
+        nothing = np.zeros((1, 1), np.int32)
+        return Counts(nothing, nothing, (0.0, 0.0))
     beams = _beams(evidence, params)
     hit_bearing, hit_at, in_front = _draw_hits(evidence, beams, params)
     origin, shape = _extent(hit_at, evidence, params.resolution_m)
@@ -58,40 +65,46 @@ def remap(evidence: PolarEvidence, params: GridParams) -> Counts:
 
 
 def _beams(evidence: PolarEvidence, params: GridParams) -> Beams:
-    heading, B = evidence.heading, len(evidence.heading)
-    gap = np.mod(np.roll(heading, -1) - heading, 2.0 * np.pi) if B > 1 else np.full(B, 2.0 * np.pi)
+    direction = np.column_stack([np.cos(evidence.heading), np.sin(evidence.heading)])
+    point = evidence.origin + _place(evidence.surface, evidence.surface_side, direction)
+    # Repeated bearings look the same way and share their neighbours.
+    group = np.cumsum(np.diff(evidence.heading, prepend=-np.inf) > _SAME_HEADING) - 1
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    heading = evidence.heading[first]
+    gap = np.mod(np.roll(heading, -1) - heading, 2.0 * np.pi) if len(heading) > 1 else np.full(1, 2.0 * np.pi)
     limit = np.radians(params.max_beam_deg)
     usual = float(np.median(gap[gap <= limit])) if (gap <= limit).any() else limit
     half = 0.5 * np.where(gap <= limit, gap, usual)
-    direction = np.column_stack([np.cos(heading), np.sin(heading)])
-    point = evidence.origin + _place(evidence.surface, evidence.surface_side, direction)
-    tangent = _tangents(point, gap, params.resolution_m, limit)
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(point[:, 0])
+        many = np.bincount(group[seen], minlength=len(heading))
+        mean = [np.bincount(group[seen], weights=point[seen, i], minlength=len(heading)) / many for i in (0, 1)]
+    tangent = _tangents(np.column_stack(mean), gap, params.resolution_m)[group]
     tangent[np.abs(_cross(tangent, direction)) < _MIN_COS_INCIDENCE] = np.nan
-    near = 2.0 * params.resolution_m
-    blocks = np.abs(evidence.free_to - evidence.surface) <= near
-    return Beams(direction, half, np.roll(half, 1), point, tangent, blocks)
+    blocks = np.abs(evidence.free_to - evidence.surface) <= 2.0 * params.resolution_m
+    neighbours = np.roll(first, -1)[group], np.roll(first, 1)[group]
+    return Beams(direction, half[group], np.roll(half, 1)[group], *neighbours, point, tangent, blocks)
 
 
-def _tangents(point: Array, gap: Array, resolution: float, limit: float) -> Array:
+def _tangents(point: Array, gap: Array, resolution: float) -> Array:
     """Direction (B, 2) of the wall at each point, where three points near it lie on a line; NaN elsewhere."""
     B = len(point)
     tangent = np.full((B, 2), np.nan)
     if B < 3:
         return tangent
-    stride = max(1, round(_LINE_STEP / max(float(np.median(gap)), 1e-6)))
+    stride = max(1, round(_LINE_STEP / float(np.median(gap))))
     index = np.arange(B)
     turn = np.concatenate([[0.0], np.cumsum(gap)])
-    for shift in (-2, 0, -1):  # the centred triple last: it counts most
-        i = index + shift * stride
-        a, b, c = (np.mod(i + s * stride, B) for s in range(3))
+    least = np.full(B, 0.25 * resolution)
+    for shift in (-2, 0, -1):
+        a, b, c = (np.mod(index + (shift + s) * stride, B) for s in range(3))
         chord = point[c] - point[a]
-        length = np.linalg.norm(chord, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            unit = chord / length[:, None]
+            unit = chord / np.linalg.norm(chord, axis=1)[:, None]
             bend = np.abs(_cross(unit, point[b] - point[a]))
-        swept = np.mod(turn[c] - turn[a], turn[-1])
-        straight = (bend <= 0.25 * resolution) & (swept <= 2.0 * limit * stride) & (swept < np.pi)
-        tangent[straight] = unit[straight]
+        # Near a corner more than one triple is almost straight; the straightest is the wall.
+        better = (bend <= least) & (np.mod(turn[c] - turn[a], turn[-1]) < 0.5 * np.pi)
+        tangent[better], least[better] = unit[better], bend[better]
     return tangent
 
 
@@ -123,21 +136,24 @@ def _wall_end(evidence: PolarEvidence, beams: Beams, side: int) -> Array:
 
     To the beam's edge, or to the corner with the neighbour's wall.
     """
-    half = beams.left if side > 0 else beams.right
+    half, k = (beams.left, beams.next_left) if side > 0 else (beams.right, beams.next_right)
     angle = evidence.heading + side * half
     edge = np.column_stack([np.cos(angle), np.sin(angle)])
+    # The laser moves on as the head turns.
+    ahead, aside = (evidence.origin * beams.direction).sum(axis=1), _cross(beams.direction, evidence.origin)
+    laser = _place(ahead, aside, edge)
     with np.errstate(divide="ignore", invalid="ignore"):
-        end = -_cross(beams.point - evidence.origin, edge) / _cross(beams.tangent, edge)
-        other_point, other = np.roll(beams.point, -side, axis=0), np.roll(beams.tangent, -side, axis=0)
+        end = -_cross(beams.point - laser, edge) / _cross(beams.tangent, edge)
+        other_point, other = beams.point[k], beams.tangent[k]
         det = _cross(beams.tangent, other)
         corner = _cross(other_point - beams.point, other) / np.where(np.abs(det) > 0.1, det, np.nan)
         arc = evidence.surface * half / np.abs(_cross(beams.tangent, beams.direction))
     end = np.clip(end, -2.0 * arc, 2.0 * arc)
     # A corner counts where it lies within the gap between the two bearings: elsewhere it is where a wall
     # would meet the one far behind it.
-    at = beams.point + corner[:, None] * beams.tangent - evidence.origin
-    after = side * _cross(beams.direction, at) > 0
-    before = side * _cross(at, np.roll(beams.direction, -side, axis=0)) > 0
+    at = beams.point + corner[:, None] * beams.tangent
+    after = side * _cross(beams.direction, at - evidence.origin) > 0
+    before = side * _cross(at - evidence.origin[k], beams.direction[k]) > 0
     between = after & before
     drawn: Array = np.where(between, corner, end)
     return drawn
@@ -172,8 +188,6 @@ def _passes(
     the axis; a laser behind the axis can look at a cell from two headings.
     """
     passes = np.zeros(shape[0] * shape[1], dtype=np.intp)
-    if not len(evidence.heading):
-        return passes
     rows, cols = np.divmod(np.arange(passes.size), shape[1])
     cell = np.column_stack([cols, rows])
     centre = np.asarray(origin) + (cell + 0.5) * params.resolution_m
