@@ -27,11 +27,11 @@ from scanmap.rig.stage import StageParams, open_stage
 from scanmap.sweep import SweepParams, sweep
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.motion import Drivetrain
-from scanmap.twin.ports import plug, pty_port
+from scanmap.twin.ports import plug, pty_port, tcp_port
 
 PORTS: dict[str, Callable[[Firmware], AbstractContextManager[str]]] = {"twin": plug}
 if os.name == "posix":
-    PORTS["pty"] = pty_port
+    PORTS |= {"pty": pty_port, "socket": tcp_port}
 
 
 def handles() -> int:
@@ -107,6 +107,15 @@ def test_after_close_the_laser_is_off_and_the_motor_free(stage: Stage, board: Fi
     assert eventually(lambda: not board.laser_on and not board.motor_on)
     with pytest.raises(StageError, match="gone"):
         stage.where()
+
+
+def test_a_pulled_plug_is_noticed_at_once(stage: Stage, board: Firmware) -> None:
+    stage.move_to(1.0)
+    board.faults.unplugged = True
+    with pytest.raises(StageError, match=r"is gone .*plug the board in again"):
+        for _ in range(3):  # a dying line may swallow the first bytes
+            stage.move_to(1.5)
+    stage.close()
 
 
 def test_a_second_start_finds_a_board_that_a_killed_one_left_shining(url: str, board: Firmware) -> None:
@@ -212,7 +221,7 @@ def test_by_hand_home_is_where_the_head_stands(uno: Uno) -> None:
 def test_small_faults_at_random_moments_are_repaired(uno: Uno, fault: str) -> None:
     board, url = uno
     chance = random.Random(4)
-    stage = open_grbl(StageParams(port=url, timeout_s=0.4))
+    stage = open_grbl(StageParams(port=url, timeout_s=0.2))
     for deg in range(0, 40, 2):
         if fault == "garbage":
             board.faults.garbage = chance.randbytes(20)

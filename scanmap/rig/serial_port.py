@@ -72,8 +72,11 @@ class SerialPort:
 
     def close(self) -> None:
         """Free the port; may be called twice and never raises."""
+        connection = getattr(self._port, "_socket", None)  # pyserial forgets to close one that is already dead
         try:
             self._port.close()
+            if connection is not None:
+                connection.close()
         except (OSError, ValueError):
             logger.debug("%s did not close cleanly", self.name, exc_info=True)
 

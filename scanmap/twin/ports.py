@@ -1,4 +1,4 @@
-"""Where the twin's board is plugged in: `twin://name` for pyserial, and a pty for any other program."""
+"""Where the twin's board is plugged in: `twin://name` for pyserial, a pty or a TCP port for any program."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import io
 import math
 import os
 import select
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain, count
 from typing import Any
 
@@ -114,34 +115,68 @@ def pty_port(firmware: Firmware) -> Iterator[str]:
 
     master, slave = os.openpty()
     tty.setraw(slave)
-    stop_reading, stop = os.pipe()
     firmware.open()
-    pump = threading.Thread(target=_pump, args=(firmware, master, stop_reading), name="twin pty")
+
+    def serve(stop: int) -> None:
+        _pump(firmware, master, stop)
+        os.close(master)  # a pulled plug looks like this from the other side
+
+    try:
+        with _pumping(serve):
+            yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+
+
+@contextlib.contextmanager
+def tcp_port(firmware: Firmware) -> Iterator[str]:
+    """Put a board on a TCP port of this machine, like one with WiFi; yields `socket://127.0.0.1:port`."""
+    firmware.open()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve(stop: int) -> None:
+            while stop not in select.select([server.fileno(), stop], [], [])[0]:
+                connection, _ = server.accept()
+                with connection:
+                    if _pump(firmware, connection.fileno(), stop):
+                        return
+
+        with _pumping(serve):
+            yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def _pumping(work: Callable[[int], object]) -> Iterator[None]:
+    """Run `work` in a thread; it gets a handle that becomes readable when it is to end."""
+    told, tell = os.pipe()
+    pump = threading.Thread(target=work, args=(told,), name="twin's wire")
     pump.start()
     try:
-        yield os.ttyname(slave)
+        yield
     finally:
-        os.write(stop, b"x")
+        os.write(tell, b"x")
         pump.join()
-        for handle in (slave, stop_reading, stop):
-            os.close(handle)
+        os.close(told)
+        os.close(tell)
 
 
-def _pump(firmware: Firmware, master: int, stop: int) -> None:
-    """Carry bytes both ways until told to stop, or until the board is unplugged; closes `master`."""
+def _pump(firmware: Firmware, wire: int, stop: int) -> bool:
+    """Carry bytes both ways until the other side hangs up, or the board is unplugged; True when told to stop."""
     try:
         while not firmware.faults.unplugged:
             pause = 0.0 if firmware.instant else min(firmware.next_event(), TICK_S)
-            readable, _, _ = select.select([master, stop], [], [], max(pause, 5e-4))
+            readable, _, _ = select.select([wire, stop], [], [], max(pause, 5e-4))
             if stop in readable:
-                return
-            if master in readable:
-                firmware.write(os.read(master, 1024))
+                return True
+            if wire in readable:
+                data = os.read(wire, 1024)
+                if not data:
+                    return False
+                firmware.write(data)
             elif firmware.instant and firmware.next_event() < math.inf:
                 firmware.wait(firmware.next_event())
             if out := firmware.read(4096):
-                os.write(master, out)
+                os.write(wire, out)
     except OSError:
         pass  # the other side hung up
-    finally:
-        os.close(master)
+    return False
