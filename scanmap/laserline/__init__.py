@@ -1,5 +1,15 @@
 """Image (+ background) to `LaserLine`: one sub-pixel column per row."""
 
-from scanmap.laserline.line import LaserLine, LaserLineParams, Reason, find_laser_line
+from scanmap.laserline.grey import binary_image, overlay, to_grey
+from scanmap.laserline.line import LaserLine, LaserLineParams, Reason, find_laser_line, needs_colour
 
-__all__ = ["LaserLine", "LaserLineParams", "Reason", "find_laser_line"]
+__all__ = [
+    "LaserLine",
+    "LaserLineParams",
+    "Reason",
+    "binary_image",
+    "find_laser_line",
+    "needs_colour",
+    "overlay",
+    "to_grey",
+]

@@ -1,0 +1,228 @@
+"""Where the line could be: a few columns per block of rows, and the path through them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+BLOCK = 4  # rows summed into one: a quarter of the search, twice the signal to noise
+COUNT = 3  # candidates per block
+# Matched filters: width of the centre and distance of the two sides it must outshine [px].
+_FILTERS = ((5, 7), (11, 15), (21, 27))
+_MARGIN = 40  # [px] what the widest filter needs beside the window
+_APART = 8  # [px] two candidates are at least this far apart
+_CONNECTED_PX = 9.0  # a line does not run farther than this from block to block
+_JUMP = 1.6  # what leaving a line costs, in logarithms of signal to noise
+
+
+class Candidates(NamedTuple):
+    """Candidates of B blocks, strongest first; arrays (B, COUNT)."""
+
+    column: F32  # [px] in the whole image, to a pixel or two
+    snr: F32  # response over the noise; 0 where there is none
+
+
+def noise_of(plane: U8) -> float:
+    """Standard deviation of a sample's noise [grey levels], from differences of neighbours in a few rows."""
+    rows = plane[:: max(1, len(plane) // 48)].astype(np.int16)
+    step = np.abs(rows[:, 1:] - rows[:, :-1])
+    # Half of all differences of Gaussian noise lie below 0.954 sigma; counting is finer than the median of integers.
+    count = np.bincount(step.ravel(), minlength=64)[:64].cumsum() / step.size
+    k = int(np.searchsorted(count, 0.5))
+    below = count[k - 1] if k else 0.0
+    median = k - 0.5 + (0.5 - below) / max(count[k] - below, 1e-9)
+    return float(max(median / 0.954, 0.3))
+
+
+def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Candidates:
+    """The strongest narrow bright places of each block of rows.
+
+    Args:
+        plane: (H, W).
+        window: (H, 2) first and last column of each row, NaN where a row can have no line.
+        noise: standard deviation of a sample [grey levels].
+
+    The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
+    have a bright side and score nothing. Three widths of the filter cover lines of sigma 0.7 to 8 px.
+    """
+    height, width = plane.shape
+    blocks = -(-height // BLOCK)
+    first, last = _block_window(window, blocks)
+    low = max(0, int(np.nanmin(first)) - _MARGIN)
+    high = min(width, int(np.nanmax(last)) + _MARGIN + 1)
+    response = _response(_summed(plane[:, low:high], blocks))
+    x = np.arange(low, high, dtype=np.float32)
+    if (np.nanmax(first) - np.nanmin(first) > 1) or (np.nanmax(last) - np.nanmin(last) > 1) or np.isnan(first).any():
+        outside = (x < first[:, None]) | (x > last[:, None]) | np.isnan(first)[:, None]
+        response[outside] = 0.0
+    else:
+        response[:, : int(np.ceil(first[0])) - low] = 0.0
+        response[:, int(np.floor(last[0])) - low + 1 :] = 0.0
+    column = np.empty((blocks, COUNT), np.float32)
+    snr = np.empty((blocks, COUNT), np.float32)
+    rows = np.arange(blocks)
+    around = np.arange(-_APART, _APART + 1)
+    for k in range(COUNT):
+        best = response.argmax(axis=1)
+        column[:, k], snr[:, k] = best + low, response[rows, best]
+        if k + 1 < COUNT:
+            response[rows[:, None], np.clip(best[:, None] + around, 0, response.shape[1] - 1)] = 0.0
+    return Candidates(column, np.maximum(snr, 0.0) / (noise * np.float32(1.35 * np.sqrt(BLOCK))))
+
+
+def colour_doubt(image: U8, channel: int, candidates: Candidates) -> F32:
+    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, less for another.
+
+    The laser's colour is measured from the strongest candidates themselves, as the height of the line in the
+    other channels relative to its own. Where its own channel is saturated, colour says nothing.
+    """
+    rows = np.minimum(np.arange(len(candidates.column)) * BLOCK + BLOCK // 2, len(image) - 1)
+    middle = np.clip(candidates.column.astype(np.intp), 0, image.shape[1] - 1)
+    profile = np.zeros((*middle.shape, 3), np.float32)
+    side = np.zeros_like(profile)
+    for offset in (-1, 0, 1):
+        profile += image[rows[:, None], np.clip(middle + offset, 0, image.shape[1] - 1)]
+    for offset in (-9, -8, 8, 9):
+        side += image[rows[:, None], np.clip(middle + offset, 0, image.shape[1] - 1)]
+    height = profile / 3.0 - side / 4.0
+    saturated = profile[..., channel] / 3.0 >= 235.0
+    others = [c for c in range(3) if c != channel]
+    share = np.clip(height[..., others].max(axis=-1) / np.maximum(height[..., channel], 1.0), -0.5, 1.5)
+    strong = ~saturated & (candidates.snr > 20.0)
+    if strong[:, 0].sum() < 8:
+        return np.ones_like(candidates.snr)
+    weight = candidates.snr[strong]
+    order = np.argsort(share[strong])
+    laser = float(share[strong][order][np.searchsorted(np.cumsum(weight[order]), 0.25 * weight.sum())])
+    doubt = np.clip(1.0 - 2.5 * (share - laser - 0.25), 0.1, 1.0)
+    return np.where(saturated, 1.0, doubt).astype(np.float32)
+
+
+def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
+    """One column (B,) for each block, NaN where none is good enough.
+
+    Dynamic programming over the candidates: the path with the largest sum of log(score / min_snr), where
+    going on along a line is free and jumping to another costs. Where no block has a rival the best is taken.
+    """
+    gain = np.log(np.maximum(score, 1e-3) / min_snr)
+    best = gain.argmax(axis=1)
+    rows = np.arange(len(best))
+    chosen = np.where(gain[rows, best] > 0, candidates.column[rows, best], np.nan).astype(np.float32)
+    rivals = (gain > 0).sum(axis=1) > 1
+    if not rivals.any():
+        return chosen
+    return _best_path(candidates.column, gain, chosen)
+
+
+def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows (N,) that may carry the line, and the integer column (N,) of its peak in each.
+
+    A row looks around the column its block's path has there, interpolated along the line; near a jump it looks
+    at the neighbours' columns too and takes where the line stands out most.
+    """
+    height, width = plane.shape
+    row = np.arange(height)
+    block = row // BLOCK
+    centre = np.arange(len(path)) * BLOCK + 0.5 * (BLOCK - 1)
+    step = np.diff(path)
+    smooth = np.abs(step) <= _CONNECTED_PX
+    slope = np.zeros(len(path), np.float32)
+    slope[1:-1] = np.where(smooth[1:] & smooth[:-1], 0.5 * (step[1:] + step[:-1]), 0.0) / BLOCK
+    padded = np.concatenate([[np.nan], path, [np.nan]])
+    own = path[block] + slope[block] * (row - centre[block])
+    best, height_of_best = _stand_out(plane, row, own)
+    jumpy = ~np.concatenate([[True], smooth, [True]])
+    near_jump = (jumpy[1:] | jumpy[:-1])[block]
+    at = np.flatnonzero(near_jump)
+    if not at.size:
+        found = np.flatnonzero((height_of_best > 0) & np.isfinite(window[:, 0]))
+        return found, best[found]
+    for neighbour in (padded[:-2], padded[2:]):
+        rival, response = _stand_out(plane, at, neighbour[block[at]])
+        better = response > height_of_best[at] * 1.05
+        best[at[better]], height_of_best[at[better]] = rival[better], response[better]
+    found = np.flatnonzero((height_of_best > 0) & np.isfinite(window[:, 0]))
+    return found, best[found]
+
+
+def _stand_out(plane: U8, row: NDArray[np.intp], column: F32) -> tuple[NDArray[np.intp], F32]:
+    """The place within 5 px of `column` (N,) that stands out most, and by how much; 0 where column is NaN."""
+    reach, far = 5, 9
+    middle = np.rint(np.nan_to_num(column, nan=0.0)).astype(np.intp)
+    x = np.clip(middle[:, None] + np.arange(-reach - far, reach + far + 1), 0, plane.shape[1] - 1)
+    y = plane[row[:, None], x].astype(np.float32)
+    y = cv2.blur(y, (3, 1), borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.blur(y, (5, 1), borderType=cv2.BORDER_REPLICATE)
+    inner = smooth[:, far:-far]
+    side = np.maximum(smooth[:, : -2 * far], smooth[:, 2 * far :])
+    at = (inner - 0.5 * side).argmax(axis=1)
+    index = np.arange(len(row))
+    response = np.where(np.isfinite(column), np.maximum(inner[index, at] - side[index, at], 1e-3), 0.0)
+    return middle - reach + at, response.astype(np.float32)
+
+
+def _best_path(column: F32, gain: F32, fallback: F32) -> F32:
+    blocks = len(column)
+    columns, gains = column.tolist(), gain.tolist()
+    # A state per candidate and one for "no line here", which costs nothing and connects to everything.
+    total = [0.0] * (COUNT + 1)
+    where: list[float] = [float("nan")] * (COUNT + 1)
+    back: list[list[int]] = []
+    for k in range(blocks):
+        fresh, came = [], []
+        for j in range(COUNT + 1):
+            own = gains[k][j] if j < COUNT else 0.0
+            value, source = -1e30, COUNT
+            for i in range(COUNT + 1):
+                jump = j < COUNT and i < COUNT and abs(columns[k][j] - where[i]) > _CONNECTED_PX
+                candidate = total[i] - (_JUMP if jump else 0.5 * _JUMP if (j == COUNT) != (i == COUNT) else 0.0)
+                if candidate > value:
+                    value, source = candidate, i
+            fresh.append(value + own if j == COUNT or own > 0 else -1e29)
+            came.append(source)
+        total, where = fresh, [*columns[k], float("nan")]
+        back.append(came)
+    path = fallback.copy()
+    state = max(range(COUNT + 1), key=lambda j: total[j])
+    for k in range(blocks - 1, -1, -1):
+        path[k] = columns[k][state] if state < COUNT else np.nan
+        state = back[k][state]
+    return path
+
+
+def _block_window(window: NDArray[np.float64], blocks: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """First and last column (B,) that any row of a block can have."""
+    padded = np.full((blocks * BLOCK, 2), np.nan)
+    padded[: len(window)] = window
+    by_block = padded.reshape(blocks, BLOCK, 2)
+    some = np.isfinite(by_block[..., 0]).any(axis=1)
+    first, last = np.full(blocks, np.nan), np.full(blocks, np.nan)
+    first[some] = np.nanmin(by_block[some, :, 0], axis=1)
+    last[some] = np.nanmax(by_block[some, :, 1], axis=1)
+    return first, last
+
+
+def _summed(plane: U8, blocks: int) -> NDArray[np.uint16]:
+    height, width = plane.shape
+    if height % BLOCK:
+        plane = np.concatenate([plane, np.repeat(plane[-1:], blocks * BLOCK - height, axis=0)])
+    summed: NDArray[np.uint16] = plane.reshape(blocks, BLOCK, width).sum(axis=1, dtype=np.uint16)
+    return summed
+
+
+def _response(summed: NDArray[np.uint16]) -> F32:
+    """Largest response of the three filters, each scaled to the same noise."""
+    best = np.zeros(summed.shape, np.float32)
+    values = summed.astype(np.float32)
+    for centre, away in _FILTERS:
+        mean = cv2.blur(values, (centre, 1), borderType=cv2.BORDER_REPLICATE)
+        padded = cv2.copyMakeBorder(mean, 0, 0, away, away, cv2.BORDER_REPLICATE)
+        side = cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])
+        cv2.max(best, cv2.multiply(cv2.subtract(mean, side), float(np.sqrt(centre))), best)
+    return best

@@ -1,0 +1,142 @@
+"""From a colour image to the one plane in which the line is looked for."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.errors import ConfigError
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+
+Grey = Literal[
+    "auto",
+    "bit_index",
+    "mean",
+    "luminance_601",
+    "luminance_709",
+    "red",
+    "green",
+    "blue",
+    "red_gain",
+    "ycbcr_y",
+    "ycbcr_cr",
+    "ycbcr_cb",
+]
+
+_CHANNEL = {"blue": 0, "green": 1, "red": 2}
+# Weights of blue, green, red.
+_WEIGHTS = {
+    "mean": (1 / 3, 1 / 3, 1 / 3),
+    "luminance_601": (0.114, 0.587, 0.299),
+    "luminance_709": (0.072169, 0.715160, 0.212671),
+}
+_YCRCB = {"ycbcr_y": 0, "ycbcr_cr": 1, "ycbcr_cb": 2}
+# Rows between those that the laser's colour is measured on.
+_COLOUR_ROWS = 16
+
+
+def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = None) -> U8:
+    """One plane (H, W) of a BGR image (H, W, 3); a grey image is returned as it is.
+
+    Args:
+        grey: conversion; `auto` takes the channel in which the laser stands out most in this image.
+        bit_index: for `bit_index`: bits n to n + 7 of the pixel's word 0x00RRGGBB, n = 0 blue, 8 green, 16 red;
+            between them they mix two channels, above 16 zeros come in from the top (the thesis's conversion).
+        channel: for `auto`: the channel, where it is known already.
+
+    `red_gain` divides red by the pixel's mean, so that bright white things do not outshine the line; the
+    YCbCr planes are those of ITU-R BT.601, full range.
+    """
+    if image.ndim == 2:
+        return image
+    if grey == "auto":
+        return _extract(image, laser_channel(image) if channel is None else channel)
+    if grey in _CHANNEL:
+        return _extract(image, _CHANNEL[grey])
+    if grey in _WEIGHTS:
+        return np.asarray(cv2.transform(image, np.array([_WEIGHTS[grey]], np.float32)), np.uint8)
+    if grey in _YCRCB:
+        return _extract(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), np.uint8), _YCRCB[grey])
+    if grey == "bit_index":
+        return _bits(image, bit_index)
+    if grey == "red_gain":
+        red, total = image[..., 2].astype(np.float32), image.sum(axis=2, dtype=np.float32)
+        return np.asarray(np.clip(red * red * 3.0 / np.maximum(total, 1.0), 0, 255), np.uint8)
+    raise ConfigError(f"grey conversion {grey!r}; valid: auto, bit_index, red, green, blue, mean, ...")
+
+
+def laser_channel(image: U8) -> int:
+    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out most.
+
+    Measured on every 16th row: height of its best line over its surroundings, the median over the rows.
+    Where the line saturates every channel alike, the widest reach of the line still tells its colour.
+    """
+    rows = image[:: min(_COLOUR_ROWS, max(1, image.shape[0] // 8))].astype(np.float32)
+    core = cv2.blur(rows, (5, 1))
+    side = np.maximum(np.roll(core, 12, axis=1), np.roll(core, -12, axis=1))
+    height = np.where(core - side > 0, core - side, 0.0)
+    best = np.sort(height.max(axis=1), axis=0)
+    strength = best[len(best) // 2 :].mean(axis=0) + 1e-3 * best.mean(axis=0)
+    return int(np.argmax(strength))
+
+
+# What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
+PEDESTAL = 16
+
+
+def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
+    """What the laser added (H, W): laser on minus laser off, lifted by `PEDESTAL`.
+
+    The exposure may have changed between the two: the off-plane is first brought to the on-plane's level by
+    the gain that matches them where neither saturates, measured on a coarse grid. It is smoothed over 3x3
+    pixels, which takes two thirds of its noise and leaves the things in it.
+
+    Args:
+        threshold: differences below it count as none [grey levels].
+    """
+    on, off = plane[::8, ::8].astype(np.float32), background[::8, ::8].astype(np.float32)
+    usable = (off > 8) & (off < 240) & (on < 240)
+    gain = float(np.median(on[usable] / off[usable])) if usable.sum() > 50 else 1.0
+    smooth = cv2.blur(background, (3, 3))
+    lit = cv2.addWeighted(plane, 1.0, smooth, -gain, float(PEDESTAL))
+    if threshold > 0:
+        lit[lit < PEDESTAL + threshold] = PEDESTAL
+    return np.asarray(lit, np.uint8)
+
+
+def binary_image(plane: U8) -> U8:
+    """The thesis's line image T6: the first brightest pixel of each row 255, everything else 0, (H, W)."""
+    binary = np.zeros_like(plane)
+    binary[np.arange(len(plane)), plane.argmax(axis=1)] = 255
+    return binary
+
+
+def overlay(plane: U8, column_px: NDArray[np.floating], colour: Literal["red", "green", "blue"] = "red") -> U8:
+    """The thesis's overlay T7: line pixels painted over the grey image, BGR (H, W, 3).
+
+    Args:
+        column_px: (H,) columns of the line, NaN where a row has none.
+    """
+    painted = np.asarray(cv2.cvtColor(plane, cv2.COLOR_GRAY2BGR), np.uint8)
+    rows = np.flatnonzero(np.isfinite(column_px))
+    columns = np.clip(np.rint(column_px[rows]), 0, plane.shape[1] - 1).astype(np.intp)
+    painted[rows, columns] = np.eye(3, dtype=np.uint8)[_CHANNEL[colour]] * 255
+    return painted
+
+
+def _extract(image: U8, channel: int) -> U8:
+    return np.asarray(cv2.extractChannel(image, channel), np.uint8)
+
+
+def _bits(image: U8, n: int) -> U8:
+    if n % 8 == 0 and n <= 16:
+        return _extract(image, n // 8)
+    word = image[..., 0].astype(np.uint32)
+    word |= image[..., 1].astype(np.uint32) << 8
+    word |= image[..., 2].astype(np.uint32) << 16
+    return ((word >> n) & 0xFF).astype(np.uint8)
