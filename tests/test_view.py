@@ -36,6 +36,7 @@ from scanmap.view import View, ViewParams, open_view, show, viewer
 from scanmap.view import entities as at
 from scanmap.view.pictures import jpeg, shrink_factor, shrunk, shrunk_lines
 from scanmap.view.scene import height_colours, laser_fan
+from scanmap.view.thesis_view import painted
 
 W, H = 160, 120
 ROWS = np.arange(H, dtype=np.float64)
@@ -186,10 +187,10 @@ def test_line_lies_in_the_picture_made_smaller(tmp_path: Path) -> None:
     line = np.array(made.rows(at.LINE, "Points2D:positions")[0])
     red = picture[10:, :, 2] * (picture[10:, :, 2] > 4.0)
     # In the viewer's coordinates, where the centre of the first pixel is 0.5.
-    painted = (red @ (np.arange(W // 2) + 0.5)) / red.sum(axis=1)
+    seen = (red @ (np.arange(W // 2) + 0.5)) / red.sum(axis=1)
     drawn = line[line[:, 1] >= 5.0, 0].reshape(-1, 2).mean(axis=1)[5:]
-    np.testing.assert_allclose(painted, drawn, atol=0.25)  # a block does not tell where in it the line is
-    assert abs((painted - drawn).mean()) < 0.03
+    np.testing.assert_allclose(seen, drawn, atol=0.25)  # a block does not tell where in it the line is
+    assert abs((seen - drawn).mean()) < 0.03
 
 
 def test_picture_and_line_come_together(tmp_path: Path) -> None:
@@ -262,9 +263,10 @@ def test_thesis_pictures(tmp_path: Path, colour: str, channel: int) -> None:
     expected = np.zeros((H, W), np.uint8)
     expected[np.arange(H), np.rint(43.25 + 0.1 * ROWS).astype(int)] = 255
     np.testing.assert_array_equal(lines, expected)
-    painted = decode_image(bytes(pictures[at.THESIS_OVERLAY][3][0])).image[expected > 0].mean(axis=0)
-    assert painted[channel] > 180
-    assert np.delete(painted, channel).max() < 60
+    expected[:10] = 0  # rows without a line are not painted
+    line = decode_image(bytes(pictures[at.THESIS_OVERLAY][3][0])).image[expected > 0].mean(axis=0)
+    assert line[channel] > 180
+    assert np.delete(line, channel).max() < 60
 
 
 def test_the_row_must_be_in_the_image(tmp_path: Path) -> None:
@@ -394,6 +396,43 @@ def test_a_full_disk_ends_the_view_in_good_order(
     assert 1 <= len(shots) <= 8
 
 
+def test_a_file_that_was_not_written_to_its_end_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cut.rrd"
+    view = opened(path)
+    view.step(one_step(0))
+    disconnect = view._recording.disconnect
+
+    def cut() -> None:
+        disconnect()
+        path.write_bytes(path.read_bytes()[:-100])
+
+    monkeypatch.setattr(view._recording, "disconnect", cut)
+    view.close()
+    assert "could not be written to its end" in caplog.text
+
+
+def test_a_closing_that_hangs_is_left_behind(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    import rerun
+
+    over, left = threading.Event(), []
+    view = opened(tmp_path / "hang.rrd")
+    real = view._recording.disconnect
+    monkeypatch.setattr(view._recording, "disconnect", over.wait)
+    monkeypatch.setattr("scanmap.view.recorder.CLOSE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(rerun, "unregister_shutdown", lambda: left.append(True))
+    view.close()
+    assert left == [True]
+    assert "could not be written" in caplog.text
+    over.set()
+    real()
+
+
 @pytest.mark.parametrize("path", ["missing/x.rrd", "."])
 def test_a_file_that_cannot_be_written(tmp_path: Path, path: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot be written .*--rrd"):
@@ -520,6 +559,19 @@ def test_shrink_factor_is_the_smallest_that_fits(width: int, limit: int) -> None
     else:
         assert width / factor <= limit
         assert factor == 1 or width / (factor - 1) > limit
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_overlay_made_smaller_still_shows_every_row(factor: int) -> None:
+    grey = np.full((H, W), 250, np.uint8)
+    column = np.where(ROWS % 12 < 6, 30.0 + ROWS, np.nan)
+    picture = painted(grey, column, "green", factor)
+    is_green = (picture == (0, 255, 0)).all(axis=2)
+    assert picture.shape == (H // factor, W // factor, 3)
+    rows = np.flatnonzero(np.isfinite(column))
+    assert is_green[rows // factor, column[rows].astype(int) // factor].all()
+    assert is_green.sum(axis=1).max() <= (1 if factor == 1 else 2 + factor)
+    assert (picture[~is_green] == 250).all()
 
 
 @pytest.mark.parametrize("shape", [(24, 40), (24, 40, 3)])

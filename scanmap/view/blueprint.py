@@ -24,7 +24,7 @@ class Eye(NamedTuple):
 
 
 # A room's size and the default sweep of 0 to 180 deg, until the points say otherwise.
-DEFAULT_EYE = Eye((0.0, -3.2, 4.2), (0.0, 1.1, -0.5))
+DEFAULT_EYE = Eye((0.0, -2.6, 4.4), (0.0, 1.7, -0.6))
 
 
 _GROWING = (at.POINTS, at.POINTS_ABOVE)
@@ -40,7 +40,7 @@ def eye_over(low: Array, high: Array, bearing: float) -> Eye:
     centre = 0.5 * (low + high)
     size = float(np.linalg.norm(high - low))
     forward = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    position = centre + size * (-0.62 * forward + np.array([0.0, 0.0, 0.68]))
+    position = centre + size * (-0.55 * forward + np.array([0.0, 0.0, 0.62]))
     target = centre - 0.04 * size * forward
     return Eye(_triple(position), _triple(target))
 
@@ -124,7 +124,7 @@ def _thesis_tab() -> rrb.Vertical:
             rrb.TimeSeriesView(origin=at.THESIS_P, name="p: pixel ratio (l - ppx) / l", plot_legend=hidden),
             rrb.TimeSeriesView(origin=at.THESIS_DISTANCE, name="d: distance [m]", plot_legend=rrb.Corner2D.LeftTop),
         ),
-        row_shares=[1, 1],
+        row_shares=[5, 6],
         name="Thesis",
     )
 
@@ -138,7 +138,7 @@ def _result_tab(eye: Eye) -> rrb.Horizontal:
     head = f"+ /{at.BODY}"
     return rrb.Horizontal(
         _world_view("Finished cloud", eye, [f"+ /{at.RESULT}/**", head], (), (at.CLOUD_ABOVE,)),
-        _world_view("Map from above", above, [f"+ /{at.RESULT_MAP}/**", head], (), ()),
+        _world_view("Map from above", above, [f"+ /{at.RESULT_MAP}/**"], (), ()),
         column_shares=[7, 4],
         name="Result",
     )

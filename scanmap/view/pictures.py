@@ -32,9 +32,9 @@ def shrunk(image: Image, factor: int) -> Image:
 
 
 def shrunk_lines(image: Image, factor: int) -> Image:
-    """An (H, W) line image made smaller, each pixel the brightest of its block, so that no line vanishes."""
-    height, width = (n // factor for n in image.shape)
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    """A line image (H, W) or (H, W, 3) made smaller, each pixel the brightest of its block: no line vanishes."""
+    height, width = (n // factor for n in image.shape[:2])
+    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, *image.shape[2:])
     largest: Image = blocks.max(axis=(1, 3))
     return largest
 

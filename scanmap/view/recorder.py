@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 import threading
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -155,9 +156,8 @@ class View:
             import rerun as rr
 
             rr.unregister_shutdown()  # it would wait for the same thing when the program ends
-            logger.warning(
-                "the view could not be closed within %.0f s: %s may be incomplete", CLOSE_TIMEOUT_S, self._rrd
-            )
+        if closing.is_alive() or (self._rrd is not None and not is_whole(self._rrd)):
+            self.complain(f"{self._rrd} could not be written to its end; is the disk full?")
 
     def __enter__(self) -> View:
         return self
@@ -199,7 +199,7 @@ class View:
         z = points[:, 2]
         if len(z):
             # Percentiles: a single stray point would wash out the colours of all that follow.
-            low, high = np.percentile(z, [3.0, 97.0])
+            low, high = np.percentile(z, [8.0, 92.0])
             self._low, self._high = min(self._low, float(low)), max(self._high, float(high))
         colours = height_colours(z, self._low, min(self._high, self._params.hide_above_m))
         above = z > self._params.hide_above_m
@@ -238,6 +238,19 @@ class View:
         self.complain(f"less than {MIN_FREE_BYTES // 1_000_000} MB free for {self._rrd}; the view ends here")
         self.close()
         return False
+
+
+def is_whole(rrd: Path) -> bool:
+    """Whether a recording has its footer, the last thing that is written."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # that the footer is missing is only a warning there
+        try:
+            RrdReader(str(rrd)).store()
+        except (RuntimeError, OSError, Warning):
+            return False
+    return True
 
 
 def line_state(found: int, rows: int, damaged: bool) -> str:

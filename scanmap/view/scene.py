@@ -127,11 +127,11 @@ def scan_colours(scan: Scan, limit: int) -> tuple[NDArray[np.float32], Colours]:
     points = scan.points.reshape(-1, 3)[valid]
     if not len(points):
         return points, np.empty((0, 3), np.uint8)
-    low, high = np.percentile(points[:, 2], [1.0, 99.0])
+    low, high = np.percentile(points[:, 2], [2.0, 98.0])
     colours = height_colours(points[:, 2], float(low), float(high))
     facing = normals(scan).reshape(-1, 3)[valid] @ _LAMP
-    light = np.where(np.isfinite(facing), 0.62 + 0.38 * facing, 0.62)
-    return points, (colours * light[:, None].clip(0.3, 1.0)).astype(np.uint8)
+    light = np.where(np.isfinite(facing), 0.78 + 0.32 * facing, 0.85)
+    return points, (colours * light[:, None].clip(0.35, 1.0)).astype(np.uint8)
 
 
 def log_grid(recording: rr.RecordingStream, path: str, grid: OccupancyGrid, *, static: bool = False) -> None:
@@ -153,6 +153,8 @@ def log_grid(recording: rr.RecordingStream, path: str, grid: OccupancyGrid, *, s
         ),
         static=static,
     )
+    # Seen from above, the head itself would not stand where it stands on the floor.
+    recording.log(f"{path}/scanner", rr.Points3D([[0.0, 0.0, 0.0]], colors=LASER_RED, radii=-5.0), static=True)
 
 
 def _rainbow() -> Colours:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
 from scanmap.errors import CalibrationError, ConfigError
-from scanmap.laserline import LaserLineParams
+from scanmap.laserline import LaserLineParams, binary_image, overlay, to_grey
 from scanmap.pipeline import Step
 from scanmap.shot import Image, decode_image
 from scanmap.triangulation import (
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-PAINT = {"red": (0, 0, 255), "green": (0, 255, 0), "blue": (255, 0, 0)}  # BGR
 ROW_COLOUR = (255, 210, 60, 150)
 
 _MODELS = {
@@ -76,21 +75,18 @@ class ThesisView:
         """
         import rerun as rr
 
-        for path, picture in self._pictures(decode_image(step.shot.image).image).items():
+        image = decode_image(step.shot.image).image
+        for path, picture in self._pictures(image, step.line.column_px).items():
             self._recording.log(path, rr.EncodedImage(contents=picture.data, media_type=picture.media_type))
 
-    def _pictures(self, image: Image) -> dict[str, Picture]:
+    def _pictures(self, image: Image, column_px: Array) -> dict[str, Picture]:
         quality, k = self._params.jpeg_quality, self._shrink
-        grey = _grey(image)
-        lines = shrunk_lines(binary_image(grey), k)
-        # One pixel beside a saturated line would vanish in a window smaller than the picture.
-        broad = np.asarray(cv2.dilate(lines, np.ones((1, 3), np.uint8)), np.uint8)
-        small = shrunk(grey, k)
+        grey = to_grey(image, self._laserline.grey, self._laserline.bit_index)
         return {
             at.THESIS_ORIGINAL: jpeg(shrunk(image, k), quality),
-            at.THESIS_GREY: jpeg(small, quality),
-            at.THESIS_BINARY: png(lines),
-            at.THESIS_OVERLAY: jpeg(overlay(small, broad, self._params.overlay_colour), quality),
+            at.THESIS_GREY: jpeg(shrunk(grey, k), quality),
+            at.THESIS_BINARY: png(shrunk_lines(binary_image(grey), k)),
+            at.THESIS_OVERLAY: jpeg(painted(grey, column_px, self._params.overlay_colour, k), quality),
         }
 
     def _log_constant(self) -> None:
@@ -132,19 +128,15 @@ def _with_models(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]
     return calibration, tuple(name for name, there in has.items() if there)
 
 
-def _grey(image: Image) -> Image:
-    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2])
+def painted(grey: Image, column_px: Array, colour: Literal["red", "green", "blue"], factor: int) -> Image:
+    """The overlay (T7), BGR, made smaller by `factor`.
 
-
-def binary_image(grey: Image) -> Image:
-    """The brightest pixel of each row 255, everything else 0 (T6)."""
-    lines = np.zeros_like(grey)
-    lines[np.arange(len(grey)), grey.argmax(axis=1)] = 255
-    return lines
-
-
-def overlay(grey: Image, lines: Image, colour: Literal["red", "green", "blue"]) -> Image:
-    """(H, W, 3) BGR: the grey image with the pixels of a line image painted (T7)."""
-    painted = np.repeat(grey[:, :, None], 3, axis=2)
-    painted[lines > 0] = PAINT[colour]
-    return painted
+    Where it is made smaller the line is three pixels wide: a single one beside a saturated line would vanish in
+    a window that is smaller still.
+    """
+    if factor == 1:
+        return overlay(grey, column_px, colour)
+    line = shrunk_lines(overlay(np.zeros_like(grey), column_px, colour), factor)
+    line = np.asarray(cv2.dilate(line, np.ones((1, 3), np.uint8)), np.uint8)
+    picture = np.repeat(shrunk(grey, factor)[:, :, None], 3, axis=2)
+    return np.where(line.any(axis=2, keepdims=True), line, picture)
