@@ -147,6 +147,11 @@ def test_a_table_is_an_obstacle_though_one_can_look_under_and_over_it():
     values = np.array([at(grid, *p) for p in top])
     assert (values == 100).mean() > 0.95
     assert not (values == 0).any()
+    # The rows over and under it do not speak against the rows of the same bearing that hit it.
+    single = grid_of(np.array([22.0]), boxes=[table], rows=600)
+    assert at(single, 1.6, 1.6 * np.tan(np.radians(22))) == 100
+    assert at(single, 2.4, 2.4 * np.tan(np.radians(22))) == 0
+    assert set(np.unique(single.log_odds)) == {np.float32(0.85), np.float32(0.0), np.float32(-0.4)}
     assert at(grid, 2.8, 1.15) == 0  # seen over the table and under it
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -39,6 +39,7 @@ def write_map(folder, pixels, *, name="m.pgm", **changes):
     return path
 
 
+@example(np.float32([[-0.19921875, 0.42, 0.421875, 0.43, -0.21, 1e-6]]), ("png", "scale"))
 @settings(max_examples=40, deadline=None)
 @given(
     odds=arrays(np.float32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.floats(-2, 3.5, width=32)),

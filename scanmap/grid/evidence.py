@@ -78,7 +78,6 @@ def polar_evidence(scan: Scan, floor: Floor, params: GridParams) -> PolarEvidenc
     laser = transform(T, origins)
     heading = _headings(scan, T, laser)
     delta = scan.points - origins[:, None].astype(np.float32)
-    delta[~scan.valid] = np.nan
     along, side, rise = _in_fan(delta, T, heading)
     height = rise + laser[:, 2:].astype(np.float32)
     bins = int(np.nanmax(along, initial=0.0) / _width(params)) + 2 + 2 * BINS_PER_CELL  # room for the filters

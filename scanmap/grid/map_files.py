@@ -197,7 +197,8 @@ def _scale_pixels(grid: OccupancyGrid) -> NDArray[np.uint8]:
     # The last pixel values on this side of each threshold: rounding must not change a cell's class.
     lightest_occupied = np.ceil(255.0 * (1.0 - OCCUPIED_THRESH)) - 1.0
     darkest_free = np.floor(255.0 * (1.0 - FREE_THRESH)) + 1.0
-    pixel = np.clip(pixel, lightest_occupied + 1.0, darkest_free - 1.0, where=grid.unknown, out=pixel)
+    # One more between: nav2 rounds to percent, and 205 would become 0, free.
+    pixel = np.clip(pixel, lightest_occupied + 1.0, darkest_free - 2.0, where=grid.unknown, out=pixel)
     pixel[grid.occupied] = np.minimum(pixel[grid.occupied], lightest_occupied)
     pixel[grid.free] = np.maximum(pixel[grid.free], darkest_free)
     alpha = np.where(grid.log_odds == 0.0, 0.0, 255.0)
