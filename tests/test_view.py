@@ -34,6 +34,7 @@ from scanmap.triangulation import (
 )
 from scanmap.view import View, ViewParams, open_view, show, viewer
 from scanmap.view import entities as at
+from scanmap.view.blueprint import eye_over
 from scanmap.view.pictures import jpeg, shrink_factor, shrunk, shrunk_lines
 from scanmap.view.scene import height_colours, laser_fan
 from scanmap.view.thesis_view import painted
@@ -169,14 +170,16 @@ def test_camera_bytes_are_untouched(scan_rrd: Recorded) -> None:
         assert bytes(blobs[step.shot.index][0]) == step.shot.image
 
 
-def test_points_project_onto_the_line_in_the_picture(scan_rrd: Recorded) -> None:
+@pytest.mark.parametrize("width_px", [0, 80])
+def test_points_project_onto_the_line_in_the_picture(tmp_path: Path, width_px: int) -> None:
     """Through the recording's own transforms and pinhole, as the viewer sees it: pixel centres at 0.5."""
-    K = np.reshape(scan_rrd.rows(at.IMAGE, "Pinhole:image_from_camera", static=True)[None], (3, 3)).T
+    made = recorded(tmp_path / "p.rrd", steps(), image_width_px=width_px, thesis_tab=False)
+    K = np.reshape(made.rows(at.IMAGE, "Pinhole:image_from_camera", static=True)[None], (3, 3)).T
     for k in range(STEPS):
-        T_camera_world = inverse(scan_rrd.matrix(at.HEAD, k) @ scan_rrd.matrix(at.CAMERA, None))
-        points = transform(T_camera_world, np.array(scan_rrd.rows(at.POINTS, "Points3D:positions")[k]))
+        T_camera_world = inverse(made.matrix(at.HEAD, k) @ made.matrix(at.CAMERA, None))
+        points = transform(T_camera_world, np.array(made.rows(at.POINTS, "Points3D:positions")[k]))
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
-        np.testing.assert_allclose(pixels, scan_rrd.rows(at.LINE, "Points2D:positions")[k], atol=2e-3)
+        np.testing.assert_allclose(pixels, made.rows(at.LINE, "Points2D:positions")[k], atol=2e-3)
 
 
 def test_line_lies_in_the_picture_made_smaller(tmp_path: Path) -> None:
@@ -311,14 +314,19 @@ def test_grid_lies_on_the_floor_with_its_largest_y_on_top(tmp_path: Path) -> Non
 
 def test_finish_shows_the_cloud_and_fits_the_layout(tmp_path: Path) -> None:
     scan = Scan(HEAD.mount, H)
-    with opened(tmp_path / "f.rrd") as view:
+    with opened(tmp_path / "f.rrd", hide_above_m=0.1) as view:
         for step in steps():
             scan.add(step.profile, step.shot.bearing)
             view.step(step)
         view.finish(scan, small_grid())
     made = Recorded(tmp_path / "f.rrd")
     cloud = np.array(made.rows(at.CLOUD, "Points3D:positions", static=True)[None])
-    np.testing.assert_allclose(cloud, scan.points[scan.valid], atol=1e-6)
+    points = scan.points[scan.valid]
+    high = points[:, 2] > 0.1
+    assert high.any()
+    np.testing.assert_allclose(cloud, points[~high], atol=1e-6)
+    above = np.array(made.rows(at.CLOUD_ABOVE, "Points3D:positions", static=True)[None])
+    np.testing.assert_allclose(above, points[high], atol=1e-6)
     assert len(made.rows(at.CLOUD, "Points3D:colors", static=True)[None]) == len(cloud)
     assert made.rows(at.RESULT_GRID, "GridMap:data", static=True)
     assert made.rows(at.SCAN_STATE, "StateChange:state")[STEPS] == ["finished"]
@@ -540,6 +548,20 @@ def test_fan_lies_in_the_laser_plane(beta: float, yaw: float, pitch: float, offs
     np.testing.assert_allclose(np.linalg.norm(fan.vertices[1:] - fan.vertices[0], axis=1), 1.5)
     assert fan.vertices[1, 2] > fan.vertices[0, 2] > fan.vertices[-1, 2]  # the first row looks up
     assert fan.triangles.max() == len(fan.vertices) - 1
+
+
+@given(low=st.tuples(*[st.floats(-5, 0)] * 3), size=st.tuples(*[st.floats(0.05, 8)] * 3), bearing=st.floats(-7.0, 7.0))
+def test_the_eye_sees_everything_from_behind_and_above(
+    low: tuple[float, ...], size: tuple[float, ...], bearing: float
+) -> None:
+    corners = np.array([np.add(low, np.multiply(size, corner)) for corner in np.ndindex(2, 2, 2)])
+    eye = eye_over(corners[0], corners[-1], bearing)
+    gaze = np.subtract(eye.target, eye.position)
+    assert gaze[2] < 0
+    assert gaze[:2] @ [np.cos(bearing), np.sin(bearing)] > 0
+    seen = corners - eye.position
+    angle = np.arccos(seen @ gaze / np.linalg.norm(seen, axis=1) / np.linalg.norm(gaze))
+    assert np.degrees(angle).max() < 60
 
 
 @given(image=arrays(np.uint8, st.tuples(st.integers(4, 20), st.integers(4, 20))), factor=st.integers(1, 4))
