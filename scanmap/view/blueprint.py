@@ -40,7 +40,7 @@ def eye_over(low: Array, high: Array, bearing: float) -> Eye:
     centre = 0.5 * (low + high)
     size = float(np.linalg.norm(high - low))
     forward = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    position = centre + size * (-0.55 * forward + np.array([0.0, 0.0, 0.62]))
+    position = centre + size * (-0.6 * forward + np.array([0.0, 0.0, 0.67]))
     target = centre - 0.04 * size * forward
     return Eye(_triple(position), _triple(target))
 

@@ -130,8 +130,8 @@ def scan_colours(scan: Scan, limit: int) -> tuple[NDArray[np.float32], Colours]:
     low, high = np.percentile(points[:, 2], [2.0, 98.0])
     colours = height_colours(points[:, 2], float(low), float(high))
     facing = normals(scan).reshape(-1, 3)[valid] @ _LAMP
-    light = np.where(np.isfinite(facing), 0.78 + 0.32 * facing, 0.85)
-    return points, (colours * light[:, None].clip(0.35, 1.0)).astype(np.uint8)
+    light = np.where(np.isfinite(facing), 0.82 + 0.28 * facing, 0.9)
+    return points, (colours * light[:, None].clip(0.5, 1.0)).astype(np.uint8)
 
 
 def log_grid(recording: rr.RecordingStream, path: str, grid: OccupancyGrid, *, static: bool = False) -> None:
