@@ -283,6 +283,22 @@ def test_after_an_unasked_restart_nothing_moves_until_homed(uno: Uno) -> None:
     stage.close()
 
 
+def test_a_restart_while_homing_ends_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = Firmware(switch_deg=-3.0, instant=False, drivetrain=Drivetrain(bearing_deg=90.0))
+    board.memory.settings.update({22: 1, 23: 1})
+    board.power_cycle()
+    write = board.write
+
+    def brown_out_in_homing(data: bytes) -> None:
+        write(data)
+        if data == b"$H\n":
+            board.power_cycle()
+
+    monkeypatch.setattr(board, "write", brown_out_in_homing)
+    with plug(board) as url, pytest.raises(StageError, match="restarted by itself"):
+        open_grbl(StageParams(port=url, homing="switch", timeout_s=0.2))
+
+
 def test_auto_names_what_it_tried(monkeypatch: pytest.MonkeyPatch, uno: Uno) -> None:
     board, url = uno
     monkeypatch.setattr(grbl_module, "serial_devices", lambda: [])

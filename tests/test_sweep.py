@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -265,3 +266,112 @@ def test_a_plan_says_what_it_is() -> None:
     assert set(map(type, planned.as_metadata().values())) == {str}
     with pytest.raises(ConfigError, match=r"sweep\.passes = 0"):
         plan(SweepParams(passes=0))
+
+
+def brown_out(board: Firmware) -> None:
+    board.power_cycle()
+
+
+def limit_switch(board: Firmware) -> None:
+    board.trip_limit()
+
+
+def unplug(board: Firmware) -> None:
+    board.faults.unplugged = True
+
+
+def hang(board: Firmware) -> None:
+    board.faults.mute = True
+
+
+def lose_ok(board: Firmware) -> None:
+    board.faults.lose_ok = 1
+
+
+def lose_line(board: Firmware) -> None:
+    board.faults.lose_lines = 1
+
+
+def lose_status(board: Firmware) -> None:
+    board.faults.lose_status = 2
+
+
+def noise(board: Firmware) -> None:
+    board.faults.garbage = bytes(range(256))
+
+
+class TroubledBoard(Firmware):
+    """Something happens to it at the n-th piece of data it gets."""
+
+    writes = 0
+    trouble_at = -1
+
+    def trouble(self) -> None:
+        """Replaced by the test."""
+
+    def write(self, data: bytes) -> None:
+        self.writes += 1
+        if self.writes == self.trouble_at:
+            self.trouble()
+        super().write(data)
+
+
+def run(board: TroubledBoard, first: int = 0) -> tuple[list[tuple[int, float, str]], str]:
+    """Sweep as far as it goes; what was seen, and how it ended."""
+    seen: list[tuple[int, float, str]] = []
+    params = SweepParams(step_deg=15, off_frames=True)
+    try:
+        with plug(board) as url:
+            stage = open_stage(StageParams(port=url, timeout_s=0.1, homing="switch", home_deg=-2.0, min_deg=-2))
+            with Rig(FakeCamera(board), stage, "digital twin", is_twin=True) as rig:
+                for shot in sweep(rig, params, sleep=board.wait, first=first):
+                    where, laser = picture(shot.image)
+                    assert picture(shot.background) == (where, "off")
+                    assert math.degrees(shot.bearing) == pytest.approx(where, abs=1e-4)
+                    seen.append((shot.index, round(where, 3), laser))
+    except StageError as error:
+        return seen, str(error)
+    return seen, "done"
+
+
+def homed_board() -> TroubledBoard:
+    board = TroubledBoard(switch_deg=-3.0)
+    board.memory.settings.update({22: 1, 23: 1})
+    return board
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        (brown_out, "restarted by itself|not answered"),
+        (limit_switch, "ALARM:1|alarm|not answered"),
+        (unplug, "gone"),
+        (hang, "not answered"),
+        (lose_ok, "done"),
+        (lose_line, "done"),
+        (lose_status, "done"),
+        (noise, "done"),
+    ],
+)
+def test_trouble_at_twenty_moments_loses_no_shot_before_it_and_the_resumed_scan_is_equal(
+    trouble: Callable[[TroubledBoard], None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scanmap.rig.grbl.HOMING_S", 0.3)
+    clean = homed_board()
+    whole, ended = run(clean)
+    assert (len(whole), ended) == (13, "done")
+    chance = np.random.default_rng(7)
+    for moment in chance.integers(1, clean.writes + 1, 20):
+        board = homed_board()
+        board.trouble_at = int(moment)
+        board.trouble = lambda board=board: trouble(board)  # type: ignore[method-assign, misc]
+        seen, ended = run(board)
+        assert seen == whole[: len(seen)]
+        assert len(seen) == 13 or re.search(words, ended), (moment, ended)
+        board.faults.unplugged = board.faults.mute = False
+        board.power_cycle()
+        assert not board.laser_on
+        rest, ended = run(board, first=len(seen))
+        assert ended == "done"
+        assert seen + rest == whole

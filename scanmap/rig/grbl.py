@@ -110,10 +110,12 @@ class GrblStage:
         Raises:
             StageError: no answer, or refused.
         """
-        if self.laser_switchable:
-            if not on and self._link.in_motion:
-                self._link.stop()  # M5 would wait for the end of the way
-            self._link.command(f"M3 S{self._params.laser_s:g}" if on else "M5", despite_fault=not on)
+        if not self.laser_switchable:
+            return
+        if not on and (self._link.in_motion or self._link.fault):
+            self._link.stop()  # M5 would wait for the end of the way, and be refused in an alarm; a reset is obeyed
+        else:
+            self._link.command(f"M3 S{self._params.laser_s:g}" if on else "M5")
 
     def home(self) -> float:
         """Find `home_deg` as `[stage] homing` says and return the bearing reported [rad].
@@ -142,13 +144,12 @@ class GrblStage:
             return
         self._closed = True
         try:
+            self.laser(False)
             if self._link.in_motion:
                 self._link.stop()
-            if self.laser_switchable:
-                self._link.command("M5", despite_fault=True)
             self._release_motor()
-        except StageError:
-            logger.warning("%s could not be shut down in order; it was told to reset", self._link.name, exc_info=True)
+        except StageError as error:
+            logger.warning("%s was not shut down in order but told to reset (%s)", self._link.name, error)
         finally:
             try:
                 self._link.send_reset()

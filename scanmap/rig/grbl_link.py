@@ -7,6 +7,7 @@ switches, settings): that is what makes a lost `ok` repairable.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 
@@ -16,6 +17,7 @@ from scanmap.rig.grbl_protocol import Banner, Status
 from scanmap.rig.serial_port import SerialPort
 
 POLL_S = 0.25  # `?` while waiting, or more often for a short time-out; grbl wants no more than 5 to 10 a second
+BUSY_STATES = ("Run", "Jog", "Home", "Hold", "Door")  # a board in another state has nothing left to do
 BRAKE_POLL_S = 0.05
 ATTEMPTS = 3
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
@@ -54,7 +56,7 @@ class GrblLink:
             raise StageError(f"line of {len(line)} characters does not fit the board's buffer of 127: {line[:40]}...")
         if not self._answered:
             self.stop()
-        refusal = ""
+        answer = refusal = ""
         for _ in range(ATTEMPTS):
             for stale in self._port.drain():
                 self._note(stale)
@@ -70,6 +72,8 @@ class GrblLink:
                 break
             refusal = answer or f"no ok for {line!r}"
             logger.warning("%s: %s; sent again", self.name, refusal)
+        if not answer and self.fault:
+            raise StageError(self.fault)
         raise StageError(f"stage {self.name} refused {line!r}: {refusal}")
 
     def status(self) -> Status:
@@ -94,13 +98,8 @@ class GrblLink:
             StageError: the board does not answer.
         """
         self._port.write(protocol.HOLD)
-        deadline = time.monotonic() + max(self._timeout_s, STILL_S)
-        while time.monotonic() < deadline:
-            status = self.status()
-            if status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate):
-                break
-            if line := self._port.read_line(BRAKE_POLL_S):
-                self._note(line)
+        with contextlib.suppress(StageError):  # a board halted by an alarm obeys nothing but the reset
+            self._await_rest()
         self.reset()
 
     def reset(self) -> Banner:
@@ -137,8 +136,17 @@ class GrblLink:
         """Free the port; never raises."""
         self._port.close()
 
+    def _await_rest(self) -> None:
+        deadline = time.monotonic() + max(self._timeout_s, STILL_S)
+        while time.monotonic() < deadline:
+            status = self.status()
+            if status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate):
+                return
+            if line := self._port.read_line(BRAKE_POLL_S):
+                self._note(line)
+
     def _await_answer(self, silence_s: float, despite_fault: bool) -> tuple[str, list[str]]:
-        """`ok`, an error in words, or `""` where the board is idle and the answer got lost."""
+        """`ok`, an error in words, or `""` where the board rests and the answer got lost."""
         wait = _Wait(silence_s, self._poll_s)
         information: list[str] = []
         while True:
@@ -192,7 +200,7 @@ class _Wait:
         self._silence_s = silence_s
         self._heard = self._polled = self._moved = now
         self._position: tuple[float, ...] | None = None
-        self._idle_reports = 0
+        self._resting_reports = 0
         self._resumed = False
 
     def is_silent(self) -> bool:
@@ -214,7 +222,7 @@ class _Wait:
         now = self._heard = time.monotonic()
         if status.position != self._position:
             self._position, self._moved = status.position, now
-        self._idle_reports = self._idle_reports + 1 if status.state == "Idle" else 0
+        self._resting_reports = 0 if status.state in BUSY_STATES else self._resting_reports + 1
         if status.state in ("Hold", "Door") and status.substate == 0:
             if self._resumed:
                 raise StageError(
@@ -227,4 +235,4 @@ class _Wait:
             raise StageError(
                 f"stage {port.name} runs but stands at {status.position[0]:g}: check the motor, then home it"
             )
-        return self._idle_reports >= 2
+        return self._resting_reports >= 2
