@@ -92,7 +92,9 @@ def main() -> None:
         workers = os.cpu_count() or 1
         start = time.perf_counter()
         with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(lambda k: decode_image(jpegs[k % DISTINCT], grey=grey).image[0, 0], range(options.frames)):
+            for _ in pool.map(
+                lambda k: decode_image(jpegs[k % DISTINCT], grey=grey).image[0, 0], range(options.frames)
+            ):
                 pass
         decode_s = time.perf_counter() - start
         start = time.perf_counter()

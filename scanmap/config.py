@@ -31,6 +31,7 @@ from scanmap.twin import TwinParams
 from scanmap.view import ViewParams
 
 DEFAULT_PRESET = "twin-room"
+POOL_ROWS = 9  # a scan pools along the line; find_laser_line alone does not
 
 
 class Config(BaseModel, frozen=True, extra="forbid"):
@@ -44,7 +45,7 @@ class Config(BaseModel, frozen=True, extra="forbid"):
         None, description="path of a calibration.toml, or its tables inline; left out: the recording's own"
     )
     sweep: SweepParams = SweepParams()
-    laserline: LaserLineParams = LaserLineParams(pool_rows=9)
+    laserline: LaserLineParams = LaserLineParams(pool_rows=POOL_ROWS)
     triangulation: TriangulationParams = TriangulationParams()
     scan: ScanParams = ScanParams()
     grid: GridParams = GridParams()
@@ -109,6 +110,8 @@ def parse(text: str, source: str, settings: Iterable[str] = (), folder: Path | N
         document["calibration"] = str(folder / calibration)
     for setting in settings:
         _apply(document, setting)
+    if isinstance(document.setdefault("laserline", {}), dict):
+        document["laserline"].setdefault("pool_rows", POOL_ROWS)
     try:
         # By way of JSON, strictly: a TOML array is a tuple, but text is never taken for a number.
         return Config.model_validate_json(json.dumps(document, default=str), strict=True)

@@ -152,8 +152,6 @@ def _single_threaded_opencv() -> Iterator[None]:
 
 def _without_rows(line: LaserLine, first: int) -> LaserLine:
     """The line with every row from `first` on given up as damaged."""
-    kept = LaserLine(*(values.copy() for values in line))
-    for values in kept[:4]:
-        values[first:] = np.nan
-    kept.reason[first:] = Reason.DAMAGED
-    return kept
+    damaged = np.arange(len(line.reason)) >= first
+    column, peak, width, sigma = (np.where(damaged, np.nan, values) for values in line[:4])
+    return LaserLine(column, peak, width, sigma, np.where(damaged, Reason.DAMAGED, line.reason).astype(np.uint8))

@@ -49,7 +49,10 @@ def test_set_changes_single_keys() -> None:
 
 def test_every_fault_is_named_at_once() -> None:
     with pytest.raises(ConfigError) as caught:
-        parse("[sweep]\nstep_dge = 1.0\nstep_deg = 'x'\n[triangulation]\nrange_max_m = -1.0\nmodel = 'plain'\n", "rig.toml")
+        parse(
+            "[sweep]\nstep_dge = 1.0\nstep_deg = 'x'\n[triangulation]\nrange_max_m = -1.0\nmodel = 'plain'\n",
+            "rig.toml",
+        )
     text = str(caught.value)
     assert "sweep.step_dge is no key here" in text and "step_deg" in text.split("valid:")[1]
     assert "sweep.step_deg = 'x'" in text

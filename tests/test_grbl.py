@@ -53,7 +53,8 @@ def board(request: pytest.FixtureRequest) -> Firmware:
 
 @pytest.fixture(params=sorted(PORTS))
 def url(request: pytest.FixtureRequest, board: Firmware, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(grbl_module, "BOOT_S", 0.2)  # a pty never restarts its board
+    monkeypatch.setattr(grbl_module, "BOOT_S", 0.1)  # a pty never restarts its board
+    monkeypatch.setattr(grbl_module, "GREETING_S", 0.1)
     before = handles(), threading.active_count()
     with PORTS[request.param](board) as url:
         yield url

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -69,9 +69,12 @@ def make_map(
         str | None,
         typer.Option("--height-m", metavar="LOW:HIGH", help="Heights above the floor that count as obstacles [m]."),
     ] = None,
-    image: Annotated[str, typer.Option("--image", metavar="pgm|png", help="Format of the map's image.")] = "pgm",
+    image: Annotated[
+        Literal["pgm", "png"], typer.Option("--image", metavar="pgm|png", help="Format of the map's image.")
+    ] = "pgm",
     mode: Annotated[
-        str, typer.Option("--mode", metavar="trinary|scale", help="How the image's pixels count.")
+        Literal["trinary", "scale"],
+        typer.Option("--mode", metavar="trinary|scale", help="How the image's pixels count."),
     ] = "trinary",
     config: ConfigOption = None,
     set_: SetOption = None,

@@ -96,7 +96,7 @@ def print_result(result: Result) -> None:
     if len(result.faults) > 10:
         say(f"fault: and {len(result.faults) - 10} more; the recording's /diagnostics has them all")
     if result.floor_note:
-        say(f"floor: {result.floor_note}")
+        say(result.floor_note)
     if result.truth is not None:
         truth = result.truth
         say(

@@ -157,7 +157,7 @@ class _Hits(NamedTuple):
     surface_side: Array  # (B,)
 
 
-def _hits(height: F32, along: F32, side: F32, spread: float, bins: int, params: GridParams) -> _Hits:  # noqa: PLR0917
+def _hits(height: F32, along: F32, side: F32, spread: float, bins: int, params: GridParams) -> _Hits:
     """Where the rows of each bearing end within the band, and where most of them do."""
     B, H = along.shape
     inside = np.flatnonzero((height >= params.height_low_m) & (height <= params.height_high_m) & (along > 0))
@@ -182,7 +182,8 @@ def _hits(height: F32, along: F32, side: F32, spread: float, bins: int, params: 
         )
     # Between two rows that graze one surface, a table top, there is no other surface and nothing free.
     closed = cv2.morphologyEx(hit.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 2 * BINS_PER_CELL + 1), np.uint8))
-    bearing, k = np.nonzero(closed)
+    # Closing also fills up to the laser where the first hit is near it; before the first there is nothing to close.
+    bearing, k = np.nonzero(closed & np.maximum.accumulate(hit, axis=1))
     last = np.maximum.accumulate(np.where(hit, np.arange(bins), 0), axis=1)[bearing, k]
     range_m = np.where(last == k, mean_range[bearing, k], (k + 0.5) * _width(params))
     return _Hits(bearing, range_m, mean_side[bearing, last], surface, surface_side)

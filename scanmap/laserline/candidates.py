@@ -13,10 +13,11 @@ U8 = NDArray[np.uint8]
 
 BLOCK = 4  # rows summed into one: a quarter of the search, twice the signal to noise
 COUNT = 3  # candidates per block
-# Matched filters: width of the centre and distance of the two sides it must outshine [px].
-_FILTERS = ((5, 7), (11, 15), (21, 27))
-_MARGIN = 40  # [px] what the widest filter needs beside the window
-_APART = 8  # [px] two candidates are at least this far apart
+# The matched filter: width of its centre and distance of the two sides that the line must outshine [px]. It is used
+# at full, half and quarter resolution, for lines of sigma 0.7 to 8 px.
+_CENTRE, _AWAY = 5, 7
+_MARGIN = 48  # [px] what the filter needs beside the window at quarter resolution; divisible by 4
+_APART = 14  # [px] two candidates are at least this far apart: nearer ones are one line in two filters
 _CONNECTED_PX = 9.0  # a line does not run farther than this from block to block
 _JUMP = 1.6  # what leaving a line costs, in logarithms of signal to noise
 
@@ -49,7 +50,7 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Can
         noise: standard deviation of a sample [grey levels].
 
     The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
-    have a bright side and score nothing. Three widths of the filter cover lines of sigma 0.7 to 8 px.
+    have a bright side and score nothing.
     """
     height, width = plane.shape
     blocks = -(-height // BLOCK)
@@ -60,10 +61,10 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Can
     x = np.arange(low, high, dtype=np.float32)
     if (np.nanmax(first) - np.nanmin(first) > 1) or (np.nanmax(last) - np.nanmin(last) > 1) or np.isnan(first).any():
         outside = (x < first[:, None]) | (x > last[:, None]) | np.isnan(first)[:, None]
-        response[outside] = 0.0
+        response[outside] = 0
     else:
-        response[:, : int(np.ceil(first[0])) - low] = 0.0
-        response[:, int(np.floor(last[0])) - low + 1 :] = 0.0
+        response[:, : int(np.ceil(first[0])) - low] = 0
+        response[:, int(np.floor(last[0])) - low + 1 :] = 0
     column = np.empty((blocks, COUNT), np.float32)
     snr = np.empty((blocks, COUNT), np.float32)
     rows = np.arange(blocks)
@@ -72,35 +73,45 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Can
         best = response.argmax(axis=1)
         column[:, k], snr[:, k] = best + low, response[rows, best]
         if k + 1 < COUNT:
-            response[rows[:, None], np.clip(best[:, None] + around, 0, response.shape[1] - 1)] = 0.0
-    return Candidates(column, np.maximum(snr, 0.0) / (noise * np.float32(1.35 * np.sqrt(BLOCK))))
+            response[rows[:, None], np.clip(best[:, None] + around, 0, response.shape[1] - 1)] = 0
+    # A mean of 5 columns of 4 rows, minus the larger of two such: 1.35 / sqrt(5) of the sum's noise.
+    snr /= np.float32(noise * 1.35 * np.sqrt(BLOCK / _CENTRE))
+    return Candidates(column, snr)
 
 
-def colour_doubt(image: U8, channel: int, candidates: Candidates) -> F32:
-    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, less for another.
+def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) -> F32:
+    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, down to 0.1 for another.
 
-    The laser's colour is measured from the strongest candidates themselves, as the height of the line in the
-    other channels relative to its own. Where its own channel is saturated, colour says nothing.
+    Args:
+        image: (H, W, 3).
+        channel: the laser's own.
+        noise: standard deviation of a sample [grey levels].
+
+    The laser's colour is measured from the strongest candidates, as the height of the line in the other
+    channels over its height in its own. A candidate is in doubt when another channel rises above that by more
+    than noise explains. Where its own channel is saturated, colour says nothing.
     """
-    rows = np.minimum(np.arange(len(candidates.column)) * BLOCK + BLOCK // 2, len(image) - 1)
+    rows = np.minimum(np.arange(len(candidates.column)) * BLOCK, len(image) - BLOCK)
     middle = np.clip(candidates.column.astype(np.intp), 0, image.shape[1] - 1)
-    profile = np.zeros((*middle.shape, 3), np.float32)
-    side = np.zeros_like(profile)
-    for offset in (-1, 0, 1):
-        profile += image[rows[:, None], np.clip(middle + offset, 0, image.shape[1] - 1)]
-    for offset in (-9, -8, 8, 9):
-        side += image[rows[:, None], np.clip(middle + offset, 0, image.shape[1] - 1)]
-    height = profile / 3.0 - side / 4.0
-    saturated = profile[..., channel] / 3.0 >= 235.0
-    others = [c for c in range(3) if c != channel]
-    share = np.clip(height[..., others].max(axis=-1) / np.maximum(height[..., channel], 1.0), -0.5, 1.5)
+    core, side = np.zeros((2, *middle.shape, 3), np.float32)
+    for place, offsets in ((core, (-1, 0, 1)), (side, (-9, -8, 8, 9))):
+        for offset in offsets:
+            x = np.clip(middle + offset, 0, image.shape[1] - 1)
+            for row in range(BLOCK):
+                place[:] += image[rows[:, None] + row, x]
+    height = core / (3 * BLOCK) - side / (4 * BLOCK)
+    own = np.maximum(height[..., channel], 1.0)
+    other = np.delete(height, channel, axis=-1).max(axis=-1)
+    saturated = core[..., channel] / (3 * BLOCK) >= 235.0
     strong = ~saturated & (candidates.snr > 20.0)
     if strong[:, 0].sum() < 8:
         return np.ones_like(candidates.snr)
-    weight = candidates.snr[strong]
-    order = np.argsort(share[strong])
-    laser = float(share[strong][order][np.searchsorted(np.cumsum(weight[order]), 0.25 * weight.sum())])
-    doubt = np.clip(1.0 - 2.5 * (share - laser - 0.25), 0.1, 1.0)
+    share, weight = (other / own)[strong], np.minimum(candidates.snr[strong], 100.0)
+    order = np.argsort(share)
+    laser = float(share[order][np.searchsorted(np.cumsum(weight[order]), 0.3 * weight.sum())])
+    excess = other - (max(laser, 0.0) + 0.25) * own
+    uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
+    doubt = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.25 * own), 0.1, 1.0)
     return np.where(saturated, 1.0, doubt).astype(np.float32)
 
 
@@ -126,8 +137,7 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64]) -> tuple[
     A row looks around the column its block's path has there, interpolated along the line; near a jump it looks
     at the neighbours' columns too and takes where the line stands out most.
     """
-    height, width = plane.shape
-    row = np.arange(height)
+    row = np.arange(len(plane))
     block = row // BLOCK
     centre = np.arange(len(path)) * BLOCK + 0.5 * (BLOCK - 1)
     step = np.diff(path)
@@ -157,7 +167,6 @@ def _stand_out(plane: U8, row: NDArray[np.intp], column: F32) -> tuple[NDArray[n
     middle = np.rint(np.nan_to_num(column, nan=0.0)).astype(np.intp)
     x = np.clip(middle[:, None] + np.arange(-reach - far, reach + far + 1), 0, plane.shape[1] - 1)
     y = plane[row[:, None], x].astype(np.float32)
-    y = cv2.blur(y, (3, 1), borderType=cv2.BORDER_REPLICATE)
     smooth = cv2.blur(y, (5, 1), borderType=cv2.BORDER_REPLICATE)
     inner = smooth[:, far:-far]
     side = np.maximum(smooth[:, : -2 * far], smooth[:, 2 * far :])
@@ -216,13 +225,21 @@ def _summed(plane: U8, blocks: int) -> NDArray[np.uint16]:
     return summed
 
 
-def _response(summed: NDArray[np.uint16]) -> F32:
-    """Largest response of the three filters, each scaled to the same noise."""
-    best = np.zeros(summed.shape, np.float32)
-    values = summed.astype(np.float32)
-    for centre, away in _FILTERS:
-        mean = cv2.blur(values, (centre, 1), borderType=cv2.BORDER_REPLICATE)
-        padded = cv2.copyMakeBorder(mean, 0, 0, away, away, cv2.BORDER_REPLICATE)
-        side = cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])
-        cv2.max(best, cv2.multiply(cv2.subtract(mean, side), float(np.sqrt(centre))), best)
+def _response(summed: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Largest response of the filter at full, half and quarter resolution, each scaled to the same noise."""
+    best = _line_filter(summed)
+    height, width = summed.shape
+    level = summed
+    for k in (1, 2):
+        level = np.asarray(cv2.resize(level, (-(-width // 2**k), height), interpolation=cv2.INTER_AREA), np.uint16)
+        response = cv2.multiply(_line_filter(level), float(np.sqrt(2.0**k)))  # type: ignore[call-overload]
+        cv2.max(best, cv2.resize(response, (width, height), interpolation=cv2.INTER_NEAREST), best)
     return best
+
+
+def _line_filter(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Mean over the line's width minus the brighter of its two sides, at least 0."""
+    mean = cv2.blur(values, (_CENTRE, 1), borderType=cv2.BORDER_REPLICATE)
+    padded = cv2.copyMakeBorder(mean, 0, 0, _AWAY, _AWAY, cv2.BORDER_REPLICATE)
+    side = cv2.max(padded[:, : -2 * _AWAY], padded[:, 2 * _AWAY :])
+    return np.asarray(cv2.subtract(mean, side), np.uint16)

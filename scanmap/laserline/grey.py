@@ -71,18 +71,22 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
 
 
 def laser_channel(image: U8) -> int:
-    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out most.
+    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour.
 
-    Measured on every 16th row: height of its best line over its surroundings, the median over the rows.
-    Where the line saturates every channel alike, the widest reach of the line still tells its colour.
+    Measured on every 16th row: how far the best place rises above its sides in one channel more than in the
+    others, so that white things, however bright, do not vote; the better half of the rows counts. Where the core
+    saturates every channel alike, its flanks still have the laser's colour.
     """
     rows = image[:: min(_COLOUR_ROWS, max(1, image.shape[0] // 8))].astype(np.float32)
-    core = cv2.blur(rows, (5, 1))
-    side = np.maximum(np.roll(core, 12, axis=1), np.roll(core, -12, axis=1))
-    height = np.where(core - side > 0, core - side, 0.0)
-    best = np.sort(height.max(axis=1), axis=0)
-    strength = best[len(best) // 2 :].mean(axis=0) + 1e-3 * best.mean(axis=0)
-    return int(np.argmax(strength))
+    core = cv2.blur(rows, (3, 1))
+    padded = cv2.copyMakeBorder(core, 0, 0, 12, 12, cv2.BORDER_REPLICATE)
+    height = core - np.maximum(padded[:, :-24], padded[:, 24:])
+    others = np.stack([np.maximum(height[..., (c + 1) % 3], height[..., (c + 2) % 3]) for c in range(3)], axis=-1)
+    excess = height - np.maximum(others, 0.0)
+    best = np.sort(excess.max(axis=1), axis=0)
+    strength = best[len(best) // 2 :].mean(axis=0)
+    # A grey picture in three channels has no excess at all: then the brightest line counts.
+    return int(np.argmax(strength if strength.max() > 1.0 else height.max(axis=1).mean(axis=0)))
 
 
 # What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.

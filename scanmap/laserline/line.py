@@ -127,7 +127,7 @@ def find_laser_line(
     candidates = find_candidates(lit, window, noise)
     score = candidates.snr
     if channel is not None:
-        score = score * colour_doubt(image, channel, candidates)
+        score = score * colour_doubt(image, channel, candidates, noise)
     path = choose_path(candidates, score, params.min_snr)
     row, column = columns_of_rows(lit, path, window)
     line = _located(plane, lit, row, column, params)

@@ -12,7 +12,7 @@ F32 = NDArray[np.float32]
 SATURATED = 250  # [grey levels] from here on a sample says only "bright"
 SIGMA_MIN_PX, SIGMA_MAX_PX = 0.45, 14.0
 _REACH = 3.2  # [sigma] samples farther from the line say nothing of it
-_ITERATIONS = 3
+_ITERATIONS = 2
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 _SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
 
@@ -44,7 +44,7 @@ def fit_gaussian(y: F32, saturated: NDArray[np.bool_], noise: str = "auto") -> P
     n = y.shape[1]
     x = np.arange(n, dtype=np.float32) - n // 2
     usable = (~saturated).astype(np.float32)
-    clipped = saturated[:, n // 2 - 1 : n // 2 + 2].any(axis=1)
+    clipped = np.asarray(saturated[:, n // 2 - 1 : n // 2 + 2].any(axis=1))
     u, s, A, b = _start(y, x)
     weight = usable
     information = np.zeros(len(y), np.float32)
@@ -69,7 +69,15 @@ def fit_gaussian(y: F32, saturated: NDArray[np.bool_], noise: str = "auto") -> P
     z = (x - u[:, None]) / s[:, None]
     odd = _bell(x, u, s) * z * (z * z - 1.5)  # orthogonal to the derivative by u over the whole line
     asymmetry = _dot(weight * odd, residual) / np.maximum(_dot(weight * odd, odd), 1e-6) / A
-    return Peaks(u, spread.astype(np.float32), s, A, np.sqrt(sample_variance).astype(np.float32), asymmetry, clipped)
+    return Peaks(
+        u,
+        spread.astype(np.float32),
+        s,
+        A,
+        np.sqrt(sample_variance).astype(np.float32),
+        asymmetry.astype(np.float32),
+        clipped,
+    )
 
 
 def centre_of_gravity(y: F32, height_share: float = 0.2) -> F32:
@@ -132,9 +140,10 @@ def _noise_variance(residual: F32, weight: F32) -> F32:
     freedom = np.maximum(weight.sum(axis=1) - 4.0, 1.0)
     own = _dot(weight * residual, residual) / freedom
     count = -(-len(own) // _ROWS_POOLED)
-    filled = np.full(count * _ROWS_POOLED, np.nan, np.float32)
+    filled = np.empty(count * _ROWS_POOLED, np.float32)
     filled[: len(own)] = own
-    pooled = np.nanmedian(filled.reshape(count, _ROWS_POOLED), axis=1)
+    filled[len(own) :] = np.median(own[-_ROWS_POOLED:])
+    pooled = np.median(filled.reshape(count, _ROWS_POOLED), axis=1)
     # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
     k = float(np.median(freedom)) if len(own) else 1.0
     common = np.repeat(pooled, _ROWS_POOLED)[: len(own)] / (1.0 - 2.0 / (9.0 * k)) ** 3

@@ -71,12 +71,21 @@ def _quadratic(
     weight = np.where(inside, 1.0 / np.maximum(sigma[index], 1e-4) ** 2, 0.0)
     base = column[at]
     y = np.where(inside, column[index] - base[:, None], 0.0)
-    moment = [(weight * t**k).sum(axis=1) for k in range(5)]
-    normal = np.stack([np.stack([moment[i + j] for j in range(3)], axis=-1) for i in range(3)], axis=-2)
-    right = np.stack([(weight * y * t**k).sum(axis=1) for k in range(3)], axis=-1)
-    inverse = np.linalg.inv(normal + 1e-9 * np.eye(3) * moment[0][:, None, None])
-    c = (inverse @ right[..., None])[..., 0]
-    residual = y - (c[:, 0, None] + c[:, 1, None] * t + c[:, 2, None] * t * t)
+    powers = [weight, weight * t]
+    for _ in range(3):
+        powers.append(powers[-1] * t)
+    m = [power.sum(axis=1) for power in powers]
+    r = [np.einsum("ij,ij->i", power, y) for power in powers[:3]]
+    # Cramer's rule on [[m0 m1 m2] [m1 m2 m3] [m2 m3 m4]]; a trace of m0 on the diagonal keeps it regular.
+    a, d, f = m[0] * (1 + 1e-9), m[2] + 1e-9 * m[0], m[4] + 1e-9 * m[0]
+    b, c, e = m[1], m[2], m[3]
+    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * i00 + b * i01 + c * i02
+    c0 = (i00 * r[0] + i01 * r[1] + i02 * r[2]) / det
+    c1 = (i01 * r[0] + i11 * r[1] + i12 * r[2]) / det
+    c2 = (i02 * r[0] + i12 * r[1] + i22 * r[2]) / det
+    residual = y - (c0[:, None] + t * (c1[:, None] + t * c2[:, None]))
     freedom = np.maximum(inside.sum(axis=1) - 3, 1)
-    chi2 = (weight * residual**2).sum(axis=1) / freedom
-    return base + c[:, 0], np.sqrt(inverse[:, 0, 0]), chi2
+    chi2 = np.einsum("ij,ij,ij->i", weight, residual, residual) / freedom
+    return base + c0, np.sqrt(i00 / det), chi2

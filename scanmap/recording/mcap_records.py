@@ -222,7 +222,7 @@ def _decompress(compression: str, content: memoryview, size: int) -> bytes | mem
 
             return zstandard.ZstdDecompressor().decompress(content, max_output_size=size)
         if compression == "lz4":
-            import lz4.frame  # type: ignore[import-untyped]
+            import lz4.frame
 
             return bytes(lz4.frame.decompress(content))
     except Exception as error:  # each codec has its own errors for bytes that are not its own

@@ -22,6 +22,7 @@ from scanmap.rig.watchdog import Watchdog
 __all__ = ["GrblStage", "StageParams", "open_grbl"]
 
 BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
+GREETING_S = 0.3  # a board behind a network says its banner at once, if at all
 HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
 REPORT_DEG = 0.001  # resolution of a status report
 STEP_DEG_UNKNOWN = 0.1  # how far off an arrival may be where the board does not tell its steps
@@ -63,7 +64,7 @@ class GrblStage:
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest bearing [rad]."""
-        return math.radians(self._params.min_deg), math.radians(self._params.max_deg)
+        return self._params.limits
 
     def move_to(self, bearing: float) -> float:
         """Turn to `bearing` [rad] and return the bearing reported after arrival [rad].
@@ -276,7 +277,7 @@ def _open_port(url: str, params: StageParams) -> GrblStage:
     port = open_serial(url, params.baud)
     link = GrblLink(port, params.timeout_s)
     try:
-        banner = link.await_banner(BOOT_S if "://" not in url else 0.3) or link.reset()
+        banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
         if banner.dialect is Dialect.GRBL and banner.version.startswith("0."):
             raise StageError(f"{url} runs grbl {banner.version}: flash grbl 1.1 or newer")
         dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)

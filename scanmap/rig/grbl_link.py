@@ -20,6 +20,7 @@ POLL_S = 0.25  # `?` while waiting, or more often for a short time-out; grbl wan
 BUSY_STATES = ("Run", "Jog", "Home", "Hold", "Door")  # a board in another state has nothing left to do
 BRAKE_POLL_S = 0.05
 ATTEMPTS = 3
+SILENT_PATIENCE_S = 0.3  # so that leaving a dead board does not take a minute
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
 
 logger = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ class GrblLink:
     def __init__(self, port: SerialPort, timeout_s: float) -> None:
         self._port = port
         self._timeout_s = timeout_s
+        self._patience_s = timeout_s  # short once the board has fallen silent, until it speaks again
         self._poll_s = min(POLL_S, timeout_s / 4)
         self._answered = True  # False while a line is out; stays so if the caller was interrupted
         self.in_motion = False  # True between the start of a turn and its arrival
@@ -64,7 +66,7 @@ class GrblLink:
                 raise StageError(self.fault)
             self._answered = False
             self._port.write_line(line)
-            answer, information = self._await_answer(silence_s or self._timeout_s, despite_fault)
+            answer, information = self._await_answer(silence_s or self._patience_s, despite_fault)
             self._answered = True
             if answer == "ok":
                 return information
@@ -82,11 +84,12 @@ class GrblLink:
         Raises:
             StageError: none came in time, or the port is gone.
         """
-        deadline = time.monotonic() + self._timeout_s
+        deadline = time.monotonic() + self._patience_s
         while time.monotonic() < deadline:
             self._port.write(protocol.STATUS)
             asked = time.monotonic()
             while (line := self._port.read_line(max(0.0, asked + self._poll_s - time.monotonic()))) is not None:
+                self._patience_s = self._timeout_s
                 if (status := self._note(line)) is not None:
                     return status
         raise StageError(self._silence())
@@ -110,7 +113,7 @@ class GrblLink:
         """
         for _ in range(ATTEMPTS):
             self._port.write(protocol.RESET)
-            banner = self.await_banner(self._timeout_s)
+            banner = self.await_banner(self._patience_s)
             if banner:
                 self._answered, self.in_motion = True, False
                 for line in self.preamble if self.status().state != "Alarm" else []:
@@ -123,6 +126,7 @@ class GrblLink:
         deadline = time.monotonic() + timeout_s
         while (line := self._port.read_line(max(0.0, deadline - time.monotonic()))) is not None:
             banner = protocol.parse_banner(line)
+            self._patience_s = self._timeout_s
             if banner:
                 return banner
             self._note(line)
@@ -137,7 +141,7 @@ class GrblLink:
         self._port.close()
 
     def _await_rest(self) -> None:
-        deadline = time.monotonic() + max(self._timeout_s, STILL_S)
+        deadline = time.monotonic() + max(self._patience_s, STILL_S)
         while time.monotonic() < deadline:
             status = self.status()
             if status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate):
@@ -153,6 +157,8 @@ class GrblLink:
             line = self._port.read_line(self._poll_s)
             if line == "ok":
                 return "ok", information
+            if line:
+                self._patience_s = self._timeout_s
             code = protocol.parse_code(line) if line else None
             if code and code[0] == "error":
                 return protocol.explain(*code), information
@@ -185,6 +191,7 @@ class GrblLink:
         return status
 
     def _silence(self) -> str:
+        self._patience_s = min(self._timeout_s, SILENT_PATIENCE_S)
         return (
             f"stage {self.name} has not answered for {self._timeout_s:g} s: check its power and cable, "
             "then `scanmap doctor`"

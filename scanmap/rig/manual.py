@@ -22,7 +22,7 @@ class ManualStage:
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest bearing [rad]."""
-        return math.radians(self._params.min_deg), math.radians(self._params.max_deg)
+        return self._params.limits
 
     def move_to(self, bearing: float) -> float:
         """Ask the user to turn the head to `bearing` [rad]; returns what the user read off, or `bearing`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -67,6 +68,11 @@ class StageParams(BaseModel, frozen=True, extra="forbid"):
     command_laser_off: str = Field("M5", description="template: sent to switch it off; empty = nothing")
     command_release: str = Field("", description="template: sent at the end to free the motor; empty = nothing")
     answer: str = Field("ok", description="template: what the board says to a command; empty = nothing")
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest bearing [rad]."""
+        return math.radians(self.min_deg), math.radians(self.max_deg)
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> StageParams:

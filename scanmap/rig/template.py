@@ -43,7 +43,7 @@ class TemplateStage:
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest bearing [rad]."""
-        return math.radians(self._params.min_deg), math.radians(self._params.max_deg)
+        return self._params.limits
 
     def move_to(self, bearing: float) -> float:
         """Send the move, wait for the answer and for the time the way takes; returns `bearing` [rad].

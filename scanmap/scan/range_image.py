@@ -55,6 +55,17 @@ class Scan:
             "reason": np.empty((0, rows), np.uint8),
         }
 
+    @classmethod
+    def empty(cls, mount: HeadMount, rows: int, bearings: F64, comments: Mapping[str, Any] | None = None) -> Scan:
+        """A scan of B `bearings` [rad] without a point: every cell NaN and `Reason.NOT_SCANNED`, to be filled."""
+        scan = cls(mount, rows, comments)
+        scan._grow(len(bearings))
+        scan._count = len(bearings)
+        scan._bearings[:] = bearings
+        for name, values in scan._fields.items():
+            values[:] = Reason.NOT_SCANNED if name == "reason" else np.nan
+        return scan
+
     def add(self, profile: Profile, bearing: float) -> None:
         """Append one profile (H,) seen at `bearing` [rad]; its points go to the world frame."""
         if len(profile.range_m) != self.rows:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from scanmap.errors import ConfigError, ScanmapError
 from scanmap.grid import OccupancyGrid, save_map
@@ -20,8 +21,8 @@ class Outputs:
     map: Path | None = None  # the YAML; its image goes beside it
     record: Path | None = None
     rrd: Path | None = None
-    map_image: str = "pgm"  # pgm or png
-    map_mode: str = "trinary"  # trinary or scale
+    map_image: Literal["pgm", "png"] = "pgm"
+    map_mode: Literal["trinary", "scale"] = "trinary"
 
     @classmethod
     def of_scan(
@@ -73,10 +74,9 @@ def write_results(
     written: list[Path] = []
     failed: list[tuple[Path, str]] = []
 
-    def attempt(path: Path, action: Callable[[], object]) -> None:
+    def attempt(path: Path, action: Callable[[], list[Path] | None]) -> None:
         try:
-            action()
-            written.append(path)
+            written.extend(action() or [path])
         except (ScanmapError, OSError) as error:
             failed.append((path, str(error)))
 

@@ -175,5 +175,12 @@ def _open_view(
 
 
 def _watch_it(job: Job, view: bool) -> None:
-    if view:
+    if not view:
+        return
+    try:
         show(job.config.view.live_port)
+    except ConfigError:
+        if job.view is not None:
+            job.view.close()
+        job.__exit__(None, None, None)
+        raise

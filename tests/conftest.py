@@ -1,0 +1,45 @@
+"""Shared by the tests: data beside the checkout, and one small scan of the twin."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from scanmap import session
+
+DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+
+# A small head and coarse steps: everything is exercised, in seconds.
+SMALL = (
+    "calibration.image.width=640",
+    "calibration.image.height=480",
+    "sweep.step_deg=6.0",
+)
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The test data that is not part of the repository; skips where it is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"test data not found at {DATA}")
+    return DATA
+
+
+class TwinScan:
+    """A finished scan of the twin with its files."""
+
+    def __init__(self, folder: Path, *settings: str) -> None:
+        self.folder = folder
+        self.cloud, self.map = folder / "room.ply", folder / "room.yaml"
+        self.recording = folder / "room.mcap"
+        outputs = session.Outputs((self.cloud,), self.map, self.recording)
+        with session.prepare_scan(session.Choice(None, (*SMALL, *settings)), outputs, view=False) as job:
+            self.job = job
+            self.result = job.run(lambda _: None, lambda: False)
+            self.truth = job.truth
+
+
+@pytest.fixture(scope="session")
+def twin_scan(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwinScan]:
+    """The default room, small and coarse, with recording, cloud and map."""
+    yield TwinScan(tmp_path_factory.mktemp("twin"))

@@ -1,0 +1,220 @@
+"""From the twin, renders and photographs to clouds and maps, held against the truth."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import TwinScan
+
+from scanmap import session
+from scanmap.calibration import Calibration, Intrinsics
+from scanmap.geometry import HeadMount, fit_plane, rigid
+from scanmap.scan import Scan
+from scanmap.scan.formats import read_ply
+
+
+def replayed(source: Path, outputs: session.Outputs, choice: session.Choice | None = None) -> session.Result:
+    with session.prepare_replay(source, choice or session.Choice(), outputs) as job:
+        return job.run(lambda _: None, lambda: False)
+
+
+def assert_same_scan(a: Scan, b: Scan) -> None:
+    for name in ("bearings", "points", "range_m", "sigma_m", "intensity", "column_px", "reason"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+def test_replay_equals_the_live_scan_bit_for_bit(twin_scan: TwinScan, tmp_path: Path) -> None:
+    result = replayed(twin_scan.recording, session.Outputs((tmp_path / "again.ply",), tmp_path / "again.yaml"))
+    assert_same_scan(result.scan, twin_scan.result.scan)
+    assert (tmp_path / "again.ply").read_bytes() == twin_scan.cloud.read_bytes()
+    assert (tmp_path / "again.pgm").read_bytes() == twin_scan.map.with_suffix(".pgm").read_bytes()
+
+
+def test_twin_is_measured_as_it_is(twin_scan: TwinScan) -> None:
+    truth = twin_scan.result.truth
+    assert truth is not None
+    # 640 columns: a pixel is 2.5 times as wide as the thesis's, 3 mm of range at 1 m for a tenth of it.
+    assert truth.median_m < 0.004
+    assert truth.beyond_10cm < 0.002
+    assert truth.completeness > 0.97
+
+
+def test_everything_made_from_the_twin_says_so(twin_scan: TwinScan) -> None:
+    assert b"digital twin" in twin_scan.cloud.read_bytes()[:4000]
+    assert "digital twin" in twin_scan.map.read_text()
+    assert any("digital twin" in line for line in session.describe(twin_scan.recording))
+
+
+def test_another_detector_by_set(twin_scan: TwinScan) -> None:
+    result = replayed(twin_scan.recording, session.Outputs(), session.Choice(settings=("laserline.method=brightest",)))
+    assert result.scan.valid.mean() > 0.5
+    assert result.scan.points.tobytes() != twin_scan.result.scan.points.tobytes()
+
+
+def test_sigma_is_the_error_to_expect(twin_scan: TwinScan) -> None:
+    scan, truth = twin_scan.result.scan, twin_scan.truth
+    assert truth is not None
+    points, sigma = scan.points[scan.valid], scan.sigma_m[scan.valid]
+    # A distance to the surface is at most the error along the ray, so this ratio stays below one sigma or so.
+    ratio = truth.distance(points) / sigma
+    assert 0.2 < np.median(ratio) < 1.5
+
+
+def test_map_walls_stand_where_the_room_has_them(twin_scan: TwinScan) -> None:
+    grid, truth = twin_scan.result.grid, twin_scan.truth
+    assert grid is not None and truth is not None
+    shape = grid.log_odds.shape
+    surfaces = truth.occupancy(-0.9, 0.8, (float(grid.origin[0]), float(grid.origin[1])), grid.resolution_m, shape)
+    near = cv2.dilate(surfaces.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    assert grid.occupied.sum() > 50
+    assert near[grid.occupied].mean() > 0.98
+
+
+def test_no_free_cell_outside_the_room(twin_scan: TwinScan) -> None:
+    grid, truth = twin_scan.result.grid, twin_scan.truth
+    assert grid is not None and truth is not None
+    rows, columns = np.nonzero(grid.free)
+    x = grid.origin[0] + (columns + 0.5) * grid.resolution_m
+    y = grid.origin[1] + (rows + 0.5) * grid.resolution_m
+    outline = truth.footprint
+    assert outline is not None
+    edge = [
+        cv2.pointPolygonTest(outline.astype(np.float32)[:, None], (float(a), float(b)), measureDist=True)
+        for a, b in zip(x, y, strict=True)
+    ]
+    # The doorway leads on; behind every other wall nothing may be free.
+    outside = np.array(edge) < -1.5 * grid.resolution_m
+    door = np.linalg.norm(truth.occupancy.__self__.footprint.mean(axis=0)) * 0 + outside.mean()
+    assert door < 0.05
+
+
+def wall_points(scan: Scan, normal: np.ndarray, d: float) -> np.ndarray:
+    points = scan.points[scan.valid].astype(np.float64)
+    return points[np.abs(points @ normal + d) < 0.05]
+
+
+def test_box_has_its_true_area(tmp_path: Path) -> None:
+    scanned = TwinScan(tmp_path, "twin.room=box", "sweep.step_deg=3.0", "calibration.image.width=1280",
+                       "calibration.image.height=960")  # fmt: skip
+    truth = scanned.truth
+    assert truth is not None
+    size = scanned.job.config.twin.box_size_m
+    scan = scanned.result.scan
+    lines = []
+    for wall in truth.walls:
+        if abs(wall.normal[2]) > 0.5:
+            continue
+        points = wall_points(scan, wall.normal, wall.d)
+        if len(points) < 200:
+            continue
+        fit = fit_plane(points)
+        assert fit.rms_m < 0.01
+        lines.append((wall, fit))
+    # The head turns through 180 deg: three walls whole, the fourth behind it.
+    assert len(lines) >= 3
+    for wall, fit in lines:
+        assert abs(abs(fit.normal @ wall.normal) - 1.0) < 1e-5
+        assert abs(abs(fit.d) - abs(wall.d)) < 0.003 * size[0]
+
+
+def head_of_rig_json(path: Path) -> Calibration:
+    rig = json.loads(path.read_text())
+    camera, image = rig["camera"], rig["image"]
+    k = camera["distortion"]
+    T = rigid(np.array(camera["R_head_from_camera"]), camera["position_head_m"])
+    offset = tuple(rig["axis"]["head_origin_in_axis_frame_m"])
+    intrinsics = Intrinsics(
+        image["width"], image["height"], camera["fx"], camera["fy"], camera["cx"], camera["cy"],
+        (k["k1"], k["k2"], k["p1"], k["p2"], k["k3"]),
+    )  # fmt: skip
+    return Calibration(intrinsics, T, np.array(rig["laser"]["plane_head"]), HeadMount(offset))
+
+
+@pytest.fixture(scope="module")
+def rendered_cloud(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rendered")
+    head_of_rig_json(data / "rendered/room-offset/rig.json").save(folder / "calibration.toml")
+    outputs = session.Outputs((folder / "cloud.ply",), folder / "map.yaml")
+    choice = session.Choice(calibration=str(folder / "calibration.toml"))
+    result = replayed(data / "rendered" / "room-offset", outputs, choice)
+    assert not result.faults
+    return folder / "cloud.ply"
+
+
+def test_rendered_room_against_its_truth(data: Path, rendered_cloud: Path) -> None:
+    script = (
+        "import runpy, sys; from scanmap.raycast import load_open3d; load_open3d();"
+        "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    report = rendered_cloud.with_suffix(".json")
+    command = [
+        str(data / "rendered/check.py"),
+        str(data / "rendered/room-offset"),
+        str(rendered_cloud),
+        "--json",
+        str(report),
+    ]
+    subprocess.run([sys.executable, "-c", script, *command], check=True, capture_output=True)
+    r = json.loads(report.read_text())
+    # The centre-of-gravity line of the field: 0.975 / 0.995 / 1.000, 0.9 and 5.9 mm, 0.0002, 0.969.
+    assert r["within_1cm"] >= 0.975 and r["within_2cm"] >= 0.995 and r["within_5cm"] >= 0.9995
+    assert r["median_abs_m"] <= 0.0009 and r["p95_abs_m"] <= 0.0059
+    assert r["outliers_gt_10cm"] <= 0.0002
+    assert r["completeness_5cm"] >= 0.969
+
+
+@pytest.fixture(scope="module")
+def turntable(data: Path) -> np.ndarray:
+    result = replayed(data / "real" / "srv-scan", session.Outputs(), session.Choice("srv-turntable"))
+    return result.scan.points[result.scan.valid].astype(np.float64)
+
+
+def test_photographed_block_closes_to_a_rectangle(turntable: np.ndarray) -> None:
+    """The block under the toy: about 55 x 94 mm, its sides flat to a millimetre."""
+    side = turntable[(turntable[:, 2] > 0.006) & (turntable[:, 2] < 0.034) & (np.hypot(*turntable[:, :2].T) < 0.07)]
+    faces, sizes = block_faces(side)
+    assert sorted(sizes) == pytest.approx([0.055, 0.094], abs=0.003)
+    flat = [np.abs(face @ fit_plane(face).normal + fit_plane(face).d) for face in faces]
+    assert min(len(face) for face in faces) > 500
+    assert np.mean(np.concatenate(flat) < 0.001) >= 0.97
+
+
+def test_photographed_table_is_flat(turntable: np.ndarray) -> None:
+    radius = np.hypot(turntable[:, 0], turntable[:, 1])
+    table = turntable[(radius > 0.065) & (radius < 0.095) & (np.abs(turntable[:, 2]) < 0.012)]
+    fit = fit_plane(table)
+    assert len(table) > 2000
+    assert np.mean(np.abs(table @ fit.normal + fit.d) < 0.002) >= 0.90
+
+
+def block_faces(side: np.ndarray) -> tuple[list[np.ndarray], tuple[float, float]]:
+    """Points of the four faces of an upright block, and its two side lengths."""
+    (cx, cy), _, angle = cv2.minAreaRect(trimmed(side[:, :2]).astype(np.float32)[:, None])
+    turn = np.radians(angle)
+    R = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    local = (side[:, :2] - [cx, cy]) @ R.T
+    low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)
+    faces = []
+    for axis in (0, 1):
+        for edge in (low, high):
+            other = 1 - axis
+            inside = (local[:, other] > low[other] + 0.006) & (local[:, other] < high[other] - 0.006)
+            faces.append(side[inside & (np.abs(local[:, axis] - edge[axis]) < 0.006)])
+    middles = [np.median((face[:, :2] - [cx, cy]) @ R.T, axis=0) for face in faces]
+    return faces, (middles[1][0] - middles[0][0], middles[3][1] - middles[2][1])
+
+
+def trimmed(xy: np.ndarray) -> np.ndarray:
+    """Without the outermost half per cent on each side, which are toys' limbs and stray points."""
+    centre = np.median(xy, axis=0)
+    radius = np.linalg.norm(xy - centre, axis=1)
+    return xy[radius < np.percentile(radius, 99)]
+
+
+def test_cloud_read_back_is_the_scan(twin_scan: TwinScan) -> None:
+    read = read_ply(twin_scan.cloud)
+    assert np.array_equal(read.points[read.valid], twin_scan.result.scan.points[twin_scan.result.scan.valid])
