@@ -338,7 +338,7 @@ def test_no_line_crashes_the_parsers(line: str) -> None:
 def test_status_reports_are_read_back(x: float, state: str) -> None:
     status = protocol.parse_status(f"<{state}|MPos:{x:.3f},0.000,1.000|Bf:15,128|FS:0,0|WCO:1.000,2.000,3.000|Pn:X>")
     assert status is not None
-    assert status.position[0] == pytest.approx(x, abs=5e-4)
+    assert status.position[0] == pytest.approx(x, abs=5.0001e-4)  # three decimals, rounded
     assert f"{status.state}:{status.substate}" in (state, f"{state}:0")
     assert status.work_offset == (1.0, 2.0, 3.0)
 
@@ -387,3 +387,15 @@ def test_after_kill_9_the_watchdog_puts_the_laser_out(end: str) -> None:
             time.sleep(0.02)
         assert not board.laser_on
         assert board.state == "Idle"  # braked first: the position is kept
+
+
+def test_many_scans_leave_nothing_behind() -> None:
+    """Fast-forward endurance: no handle, thread or queued byte is left after a scan."""
+    board = Firmware()
+    with plug(board) as url:
+        left = set()
+        for _ in range(20):
+            with Rig(NoCamera(), open_grbl(StageParams(port=url)), "twin", is_twin=True) as rig:
+                assert len(list(sweep(rig, SweepParams(step_deg=20), sleep=board.wait))) == 10
+            left.add((handles(), threading.active_count(), board.waiting(), board.memory.writes % 2))
+    assert len(left) == 1

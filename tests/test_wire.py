@@ -257,6 +257,28 @@ def test_build_info_beats_a_disguised_banner() -> None:
     assert dialect_of_build_info(["[VER:1.1h.20190825:]"], Dialect.GRBL) is Dialect.GRBL
 
 
+def test_a_board_slow_to_start_is_not_taken_for_one_that_restarts() -> None:
+    banner = b"Grbl 1.1h ['$' for help]\r\n"
+    port = ScriptedPort([(b"\x18", b""), (b"\x18", banner + banner), (b"?", at(0)), (b"$I\n", OK)])
+    link = GrblLink(SerialPort(port, "script"), 0.1)
+    assert link.reset().dialect is Dialect.GRBL
+    assert link.command("$I") == []
+    finish(port)
+
+
+def test_a_stale_ok_is_not_taken_for_the_next_answer_even_from_a_port_that_tells_one_byte_at_a_time() -> None:
+    class OneByte(ScriptedPort):
+        @property
+        def in_waiting(self) -> int:
+            return min(1, len(self.incoming))
+
+    port = OneByte([(b"M5\n", OK + OK), (b"$I\n", b"[VER:1.1h:]\r\nok\r\n")])
+    link = GrblLink(SerialPort(port, "script"), 0.1)
+    assert link.command("M5") == []
+    assert link.command("$I") == ["[VER:1.1h:]"]
+    finish(port)
+
+
 def test_template_speaks_the_users_own_language() -> None:
     script = [
         (b"S90.0 1500\n", b"hm\r\ndone 1\r\n"),

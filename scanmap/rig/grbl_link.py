@@ -21,6 +21,7 @@ BUSY_STATES = ("Run", "Jog", "Home", "Hold", "Door")  # a board in another state
 BRAKE_POLL_S = 0.05
 ATTEMPTS = 3
 SILENT_PATIENCE_S = 0.3  # so that leaving a dead board does not take a minute
+LATE_BANNER_S = 0.5
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
 
 logger = logging.getLogger(__name__)
@@ -111,10 +112,13 @@ class GrblLink:
         Raises:
             StageError: no banner came.
         """
-        for _ in range(ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             self._port.write(protocol.RESET)
             banner = self.await_banner(self._patience_s)
             if banner:
+                if attempt:  # a slow board may yet answer the other resets
+                    while self.await_banner(LATE_BANNER_S):
+                        pass
                 self._answered, self.in_motion = True, False
                 for line in self.preamble if self.status().state != "Alarm" else []:
                     self.command(line)

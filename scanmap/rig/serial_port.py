@@ -13,6 +13,7 @@ from typing import Any
 from scanmap.errors import StageError
 
 MAX_LINE_BYTES = 4096  # a longer "line" is noise at the wrong baud rate
+MAX_DRAIN_BYTES = 1 << 16  # a line that never falls silent must not hold the program
 
 logger = logging.getLogger(__name__)
 
@@ -65,10 +66,14 @@ class SerialPort:
 
     def drain(self) -> list[str]:
         """Lines that have already arrived, without waiting."""
-        lines = []
-        while (line := self.read_line(0.0) if self._pending() else None) is not None:
-            lines.append(line)
-        return lines
+        try:
+            taken = 0
+            while taken < MAX_DRAIN_BYTES and (waiting := self._port.in_waiting):
+                self._buffer += self._port.read(waiting)  # a socket only ever says 1
+                taken += waiting
+        except (OSError, ValueError, TypeError) as error:
+            raise self._gone(error) from error
+        return list(iter(self._take_line, None))
 
     def close(self) -> None:
         """Free the port; may be called twice and never raises."""
@@ -79,12 +84,6 @@ class SerialPort:
                 connection.close()
         except (OSError, ValueError):
             logger.debug("%s did not close cleanly", self.name, exc_info=True)
-
-    def _pending(self) -> bool:
-        try:
-            return b"\n" in self._buffer or bool(self._port.in_waiting)
-        except (OSError, ValueError, TypeError) as error:
-            raise self._gone(error) from error
 
     def _take_line(self) -> str | None:
         while b"\n" in self._buffer:
