@@ -37,6 +37,11 @@ class Disparity(NamedTuple):
     halo: int
 
 
+def depth_edge_slope(params: ScanParams) -> float:
+    """Tangent of the steepest incidence a surface is seen at; what rises more steeply is a depth edge."""
+    return float(np.tan(np.radians(params.max_incidence_deg)))
+
+
 def is_full_turn(bearings: NDArray[np.float64]) -> bool:
     """Whether the last of the ascending bearings [rad] neighbours the first."""
     if len(bearings) < 3:

@@ -7,55 +7,77 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.scan.links import bearing_links, disparity, row_links
+from scanmap.scan.links import bearing_links, blocks, depth_edge_slope, disparity, row_links
 from scanmap.scan.range_image import Scan, ScanParams
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 class Mesh(NamedTuple):
-    """Triangles over the points of a scan, in the order of `Scan.points[Scan.valid]`."""
+    """Triangles over the points of a scan, in the order of `scan.points[scan.valid]`."""
 
-    vertices: NDArray[np.float32]  # (N, 3) world [m]
-    triangles: NDArray[np.int32]  # (M, 3) counter-clockwise seen from the scanner
+    vertices: F32  # (N, 3) world frame [m]
+    triangles: NDArray[np.int32]  # (M, 3) counter-clockwise as the head sees them
 
 
 def mesh(scan: Scan, params: ScanParams | None = None) -> Mesh:
-    """Two triangles for every four neighbours that lie on one surface, one where a corner is missing.
+    """The points of a scan whose bearings ascend (`Scan.merged`), and triangles between those of one surface.
 
-    Cut at depth jumps: every side of a triangle along the rows or the bearings must be a link of `scan.links`. A
-    full turn closes on itself. Wants ascending bearings (`Scan.merged`).
+    A cell of four neighbours gives two triangles, split along the diagonal that bridges the smaller step in depth,
+    one where three of them hold together, none across a depth edge. All are counter-clockwise as the head sees them;
+    a scan of a full turn closes.
     """
     params = params or ScanParams()
-    valid = scan.valid
-    vertices = scan.points[valid]
     if len(scan) < 2 or scan.rows < 2:
-        return Mesh(vertices, np.empty((0, 3), np.int32))
-    reach = float(np.tan(np.radians(params.max_incidence_deg)))
-    d = disparity(scan, params, 1)
-    everything = slice(0, len(scan) + 2)
-    down = row_links(d, everything, reach)  # (B + 2, H - 1)
-    along = bearing_links(d, everything, reach)  # (B + 1, H)
-    # Padded column k + 1 is column k; the last may be followed by the first.
-    order = np.append(np.arange(len(scan)), 0)
-    here, there = slice(1, len(scan) + 1), slice(2, len(scan) + 2)
-    number = np.full(valid.shape, -1, np.int64)
-    number[valid] = np.arange(len(vertices))
-    number = number[order]
-    a, b = number[:-1, :-1], number[1:, :-1]  # this row: this bearing, the next
-    c, e = number[:-1, 1:], number[1:, 1:]  # the row below
-    left, right = down[here], down[there]
-    top, bottom = along[1:, :-1], along[1:, 1:]
-    ok_a, ok_b, ok_c, ok_e = a >= 0, b >= 0, c >= 0, e >= 0
-    whole = ok_a & ok_b & ok_c & ok_e
-    # Bearings grow to the left as the scanner looks, rows downward.
-    parts = [
-        _triangles(ok_a & ok_b & ok_c & left & top, a, b, c),
-        _triangles(whole & right & bottom, b, e, c),
-        _triangles(~ok_a & ok_b & ok_c & ok_e & right & bottom, b, e, c),
-        _triangles(~ok_c & ok_a & ok_b & ok_e & top & right, a, b, e),
-        _triangles(~ok_b & ok_a & ok_c & ok_e & left & bottom, a, e, c),
-    ]
-    return Mesh(vertices, np.concatenate(parts).astype(np.int32))
+        return Mesh(scan.points[scan.valid], np.empty((0, 3), np.int32))
+    halo, reach = 2, depth_edge_slope(params)
+    d = disparity(scan, params, halo)
+    number = np.cumsum(scan.valid.ravel(), dtype=np.int32).reshape(scan.valid.shape) - 1
+    number = np.concatenate([number, number[:1]])
+    found = []
+    for block in blocks(len(scan), scan.rows):
+        core = slice(halo, halo + block.stop - block.start + 1)
+        wide = slice(block.start, block.stop + 2 * halo)
+        known = np.isfinite(d.q[wide][core])
+        rows = row_links(d, wide, reach)[core] & known[:, 1:] & known[:, :-1]
+        bearings = bearing_links(d, wide, reach)[core][:-1] & known[1:] & known[:-1]
+        found.append(_cell_triangles(d.q[wide][core], rows, bearings, number[block.start : block.stop + 1]))
+    vertices = scan.points[scan.valid]
+    return Mesh(vertices, _facing_head(np.concatenate(found), vertices, scan))
 
 
-def _triangles(mask: NDArray[np.bool_], *corners: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.stack([corner[mask] for corner in corners], axis=-1)
+def _cell_triangles(q: F32, rows: Mask, bearings: Mask, number: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Triangles of the cells between n + 1 columns.
+
+    Args:
+        q: (n + 1, H) disparities.
+        rows: (n + 1, H - 1) links down.
+        bearings: (n, H) links to the next column.
+        number: (n + 1, H) of each point.
+    """
+    left, right, top, bottom = rows[1:], rows[:-1], bearings[:, :-1], bearings[:, 1:]  # as the head sees a cell
+    corners = {"tr": top & right, "tl": top & left, "br": bottom & right, "bl": bottom & left}
+    with np.errstate(invalid="ignore"):
+        shorter = np.abs(q[:-1, :-1] - q[1:, 1:]) <= np.abs(q[1:, :-1] - q[:-1, 1:])
+    falling = corners["tr"].astype(np.int8) + corners["bl"]  # triangles if split from top left to bottom right
+    rising = corners["tl"].astype(np.int8) + corners["br"]
+    rises = (rising > falling) | ((rising == falling) & shorter)
+    place = {"tr": number[:-1, :-1], "tl": number[1:, :-1], "br": number[:-1, 1:], "bl": number[1:, 1:]}
+    found = []
+    for corner, three, split in (
+        ("tr", ("tr", "tl", "br"), ~rises), ("bl", ("bl", "br", "tl"), ~rises),
+        ("tl", ("tl", "bl", "tr"), rises), ("br", ("br", "tr", "bl"), rises),
+    ):  # fmt: skip
+        cells = np.flatnonzero(corners[corner] & split)
+        found.append(np.stack([np.take(place[name], cells) for name in three], axis=-1))
+    return np.concatenate(found)
+
+
+def _facing_head(found: NDArray[np.int32], vertices: F32, scan: Scan) -> NDArray[np.int32]:
+    """The triangles turned round together if most show their back: rows may run up as well as down."""
+    some = found[:: max(1, len(found) // 4096)]
+    a, b, c = (vertices[some[:, k]].astype(np.float64) for k in range(3))
+    column = np.searchsorted(np.cumsum(scan.valid.sum(axis=1)), some[:, 0], side="right")
+    facing = (np.cross(b - a, c - a) * (scan.origins[column] - a)).sum(axis=-1)
+    return found if np.sign(facing).sum() >= 0 else found[:, ::-1]

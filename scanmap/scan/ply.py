@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +14,8 @@ from numpy.typing import NDArray
 from scanmap.errors import RecordingError
 from scanmap.geometry import HeadMount
 from scanmap.laserline import Reason
-from scanmap.scan.range_image import Scan
+from scanmap.scan.ply_header import PLY_TYPES, Header, parse_header
+from scanmap.scan.range_image import Scan, ScanParams
 from scanmap.scan.surface import normals
 
 # One record of the vertex element, in this order; other readers find what they know by name.
@@ -19,64 +23,59 @@ VERTEX = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "intensity", "sigma", "range", "column")]
     + [("bearing_index", "<i4"), ("row", "<i4")]
 )
-_PLY_TYPE = {"<f4": "float", "<i4": "int", "<u1": "uchar"}
-_NUMPY_TYPE = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-_PER_LINE = 8
-_UNITS = "x y z sigma range [m], column [px], intensity [grey levels]; world frame: z up, origin on the rotation axis"
+_UNITS = "x y z sigma range [m], column [px], intensity [grey levels], nx ny nz unit, 0 0 0 where not known"
+_FRAME = "world: origin on the rotation axis at laser height, x at bearing 0, z up"
+# What the scan is made of again on reading; comments of the scan's own may not take these names.
+_GEOMETRY = ("rows", "head_offset_m", "tilt_deg", "bearings_rad")
+_RESERVED = {*_GEOMETRY, "units", "frame", "sweep"}
+# Readers in C keep a header line in a buffer of 1024 bytes or less.
+_LINE = 200
+_NUMBERS_A_LINE = 8
+_MAX_CELLS = 2**30
 
 
-class PlyFile(NamedTuple):
-    """What a PLY's header says, and its vertices."""
-
-    comments: list[str]
-    vertices: NDArray[Any]  # (N,) structured
-
-
-def vertices_of(scan: Scan) -> NDArray[Any]:
-    """The scan's points as records of `VERTEX`, bearing by bearing, row by row."""
-    bearing, row = np.nonzero(scan.valid)
-    records = np.empty(len(bearing), VERTEX)
-    normal = normals(scan)
-    for k, axis in enumerate("xyz"):
-        records[axis] = scan.points[bearing, row, k]
-        records[f"n{axis}"] = normal[bearing, row, k]
-    records["intensity"], records["sigma"] = scan.intensity[bearing, row], scan.sigma_m[bearing, row]
-    records["range"], records["column"] = scan.range_m[bearing, row], scan.column_px[bearing, row]
-    records["bearing_index"], records["row"] = bearing, row
-    return records
+def write_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
+    """Write the scan's points, binary, little endian, with comments that make a `Scan` of them again."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comment_lines(scan))]
+    lines.append(f"element vertex {int(scan.valid.sum())}")
+    lines += [f"property {PLY_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
+    file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
+    for records in vertex_blocks(scan, params):
+        file.write(records.data)
 
 
-def ply_bytes(scan: Scan) -> bytes:
-    """The whole file: binary, little endian, float32."""
-    records = vertices_of(scan)
-    header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment {line}" for line in _comments(scan)]
-    header.append(f"element vertex {len(records)}")
-    header += [f"property {_PLY_TYPE[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
-    header.append("end_header\n")
-    return "\n".join(header).encode() + records.tobytes()
+def vertex_blocks(scan: Scan, params: ScanParams | None = None, columns: int = 64) -> Iterator[NDArray[Any]]:
+    """The scan's points as records of `VERTEX`, bearing by bearing, row by row, some columns at a time."""
+    normal = normals(scan, params)
+    for start in range(0, len(scan), columns):
+        block = slice(start, start + columns)
+        bearing, row = np.nonzero(scan.valid[block])
+        records = np.empty(len(bearing), VERTEX)
+        floats = records.view(np.float32).reshape(len(bearing), VERTEX.itemsize // 4)
+        floats[:, 0:3] = scan.points[block][bearing, row]
+        floats[:, 3:6] = np.nan_to_num(normal[block][bearing, row])
+        for k, values in enumerate((scan.intensity, scan.sigma_m, scan.range_m, scan.column_px)):
+            floats[:, 6 + k] = values[block][bearing, row]
+        records["bearing_index"], records["row"] = bearing + start, row
+        yield records
 
 
 def read_ply(path: Path | str) -> Scan:
-    """The scan that `ply_bytes` wrote, bit for bit where it has points; cells without are `Reason.NOT_SCANNED`.
+    """The scan that `write_ply` wrote, bit for bit where it has points; cells without are `Reason.NOT_SCANNED`.
 
     Raises:
         RecordingError: not a PLY, damaged, or without the bearing and row that make a range image.
     """
-    file = _read(Path(path))
-    missing = [name for name in VERTEX.names or () if name not in (file.vertices.dtype.names or ())]
-    facts = _facts(file.comments)
-    if missing or "rows" not in facts or "bearings_rad" not in facts:
-        lacking = ", ".join(missing) or "its comments rows and bearings_rad"
+    header, vertices = _read(Path(path))
+    facts = _facts(header.comments)
+    missing = [name for name in VERTEX.names or () if name not in (vertices.dtype.names or ())]
+    missing += [f"the comment {name}" for name in _GEOMETRY if name not in facts]
+    if missing:
         raise RecordingError(
-            f"{path} was not written by scanmap: it lacks {lacking}; a map or scan needs scanmap's PLY"
+            f"{path} is no scan by scanmap: it lacks {', '.join(missing)}; give a PLY that scanmap scan or replay wrote"
         )
     try:
-        return _scan_of(file.vertices, facts)
+        return _scan_of(vertices, facts)
     except (ValueError, IndexError) as error:
         raise RecordingError(f"{path} is damaged: {error}") from error
 
@@ -87,90 +86,115 @@ def read_points(path: Path | str) -> NDArray[np.float64]:
     Raises:
         RecordingError: not a PLY, damaged, or without x y z.
     """
-    vertices = _read(Path(path)).vertices
-    if not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
-        raise RecordingError(f"{path} has no x y z; its vertices have {', '.join(vertices.dtype.names or ())}")
+    _, vertices = _read(Path(path))
+    names = vertices.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise RecordingError(f"{path} has no x y z; its vertices have {', '.join(names) or 'nothing'}")
     return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
-def _comments(scan: Scan) -> list[str]:
-    lines = [f"{key}: {value}" for key, value in scan.comments.items()]
-    lines += [f"units: {_UNITS}", f"rows: {scan.rows}"]
-    lines += [f"head_offset_m: {' '.join(repr(float(v)) for v in scan.mount.offset_m)}"]
-    lines += [f"tilt_deg: {' '.join(repr(float(v)) for v in scan.mount.tilt_deg)}"]
-    # Radians to the last bit: degrees would have to be converted back.
-    numbers = [repr(float(b)) for b in scan.bearings]
-    lines += [f"bearings_rad: {' '.join(numbers[k : k + _PER_LINE])}" for k in range(0, len(numbers), _PER_LINE)]
-    return lines
+def comment_lines(scan: Scan) -> list[str]:
+    """What the header says beside the fields: where the scan comes from, units, mount, rows and bearings."""
+    lines: list[str] = []
+    for key, value in scan.comments.items():
+        lines += _spread(_free_key(str(key)), _text(value))
+    lines += [f"units: {_UNITS}", f"frame: {_FRAME}", f"rows: {scan.rows}"]
+    lines += _numbers("head_offset_m", scan.mount.offset_m) + _numbers("tilt_deg", scan.mount.tilt_deg)
+    if len(scan):
+        low, high = np.degrees([scan.bearings.min(), scan.bearings.max()])
+        lines.append(f"sweep: {len(scan)} bearings from {low:.3f} to {high:.3f} deg")
+    # Radians to the last bit: degrees would have to be converted back, and not every bit survives that.
+    return lines + (_numbers("bearings_rad", scan.bearings) or ["bearings_rad: "])
+
+
+def _numbers(key: str, values: Iterable[float]) -> list[str]:
+    numbers = [repr(float(value)) for value in values]
+    return [f"{key}: {' '.join(numbers[k : k + _NUMBERS_A_LINE])}" for k in range(0, len(numbers), _NUMBERS_A_LINE)]
+
+
+def _free_key(key: str) -> str:
+    key = re.sub(r"[^A-Za-z0-9_. -]", "_", key).strip() or "_"
+    return f"{key}_" if key in _RESERVED else key
+
+
+def _text(value: Any) -> str:
+    """A value as the header holds it: plain words as they are, everything else as JSON."""
+    if isinstance(value, str) and value.isascii() and value.isprintable() and value == value.strip() and value:
+        try:
+            json.loads(value)
+        except ValueError:
+            return value
+    return json.dumps(value, default=str)
+
+
+def _spread(key: str, text: str) -> list[str]:
+    parts = [text[k : k + _LINE] for k in range(0, len(text), _LINE)]
+    return [f"{key}: {parts[0]}", *(f"{key}+: {part}" for part in parts[1:])]
 
 
 def _facts(comments: list[str]) -> dict[str, str]:
-    """`key: value` comments; those that come in several lines joined."""
+    """`key: value` comments; `key+` goes on where `key` ended, a repeated key is a longer list."""
     facts: dict[str, str] = {}
     for comment in comments:
         key, colon, value = comment.partition(": ")
-        if colon:
+        if colon and key.endswith("+") and key[:-1] in facts:
+            facts[key[:-1]] += value
+        elif colon:
             facts[key] = f"{facts[key]} {value}" if key in facts else value
     return facts
 
 
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
 def _scan_of(vertices: NDArray[Any], facts: dict[str, str]) -> Scan:
-    offset = [float(v) for v in facts["head_offset_m"].split()]
-    tilt = [float(v) for v in facts["tilt_deg"].split()]
-    bearings = np.array([float(v) for v in facts["bearings_rad"].split()])
-    own = {"units", "rows", "head_offset_m", "tilt_deg", "bearings_rad"}
-    mount = HeadMount((offset[0], offset[1], offset[2]), (tilt[0], tilt[1]))
-    scan = Scan.empty(mount, int(facts["rows"]), bearings, {k: v for k, v in facts.items() if k not in own})
+    offset, tilt, bearings = (
+        [float(number) for number in facts[key].split()] for key in ("head_offset_m", "tilt_deg", "bearings_rad")
+    )
+    rows = int(facts["rows"])
+    if len(offset) != 3 or len(tilt) != 2 or rows < 1 or rows * len(bearings) > _MAX_CELLS:
+        raise ValueError(f"its comments give {rows} rows, {len(bearings)} bearings, offset {offset}, tilt {tilt}")
     at = vertices["bearing_index"], vertices["row"]
-    if len(vertices) and (min(at[0].min(), at[1].min()) < 0):
-        raise ValueError("negative bearing index or row")
+    if len(vertices) and min(at[0].min(), at[1].min()) < 0:
+        raise ValueError("negative bearing_index or row")
+    comments = {key: _value(text) for key, text in facts.items() if key not in _RESERVED}
+    mount = HeadMount((offset[0], offset[1], offset[2]), (tilt[0], tilt[1]))
+    scan = Scan.empty(mount, rows, np.array(bearings), comments)
+    cell = at[0].astype(np.intp) * rows + at[1]
+    if len(vertices) and (at[1].max() >= rows or at[0].max() >= len(bearings)):
+        raise ValueError(f"bearing_index or row beyond its {len(bearings)} bearings and {rows} rows")
+    points = scan.points.reshape(-1, 3)
     for k, axis in enumerate("xyz"):
-        scan.points[*at, k] = vertices[axis]
-    scan.intensity[at], scan.sigma_m[at] = vertices["intensity"], vertices["sigma"]
-    scan.range_m[at], scan.column_px[at] = vertices["range"], vertices["column"]
-    scan.reason[at] = Reason.OK
+        points[cell, k] = vertices[axis]
+    for name, values in (
+        ("intensity", scan.intensity), ("sigma", scan.sigma_m), ("range", scan.range_m), ("column", scan.column_px),
+    ):  # fmt: skip
+        values.reshape(-1)[cell] = vertices[name]
+    scan.reason.reshape(-1)[cell] = Reason.OK
     return scan
 
 
-def _read(path: Path) -> PlyFile:
+def _read(path: Path) -> tuple[Header, NDArray[Any]]:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
-        raise RecordingError(f"{path} is not a PLY file: it does not begin with ply and a header")
-    body = data.find(b"\n", end) + 1
-    lines = data[:end].decode("latin-1").splitlines()
     try:
-        form, count, fields = _vertex_layout(lines)
-        comments = [line.partition(" ")[2] for line in lines if line.startswith("comment ")]
-        if form == "ascii":
-            table = np.loadtxt(data[body:].decode("latin-1").splitlines()[:count], ndmin=2)
-            vertices = np.empty(len(table), np.dtype(fields))
-            for k, (name, _) in enumerate(fields):
+        header = parse_header(data)
+        if header.form == "ascii":
+            lines = data[header.size :].decode("latin-1").splitlines()[: header.vertices]
+            table = np.array([line.split()[: len(header.fields)] for line in lines], np.float64)
+            if table.shape != (header.vertices, len(header.fields)):
+                raise ValueError(f"{len(lines)} of {header.vertices} vertices are there")
+            vertices = np.empty(header.vertices, header.record)
+            for k, name in enumerate(header.record.names or ()):
                 vertices[name] = table[:, k]
         else:
-            order = ">" if form == "binary_big_endian" else "<"
-            kind = np.dtype([(name, order + type_) for name, type_ in fields])
-            vertices = np.frombuffer(data, kind, count, body)
-    except (ValueError, KeyError, IndexError) as error:
-        raise RecordingError(f"{path} is damaged or of a kind scanmap does not read: {error}") from error
-    return PlyFile(comments, vertices)
-
-
-def _vertex_layout(lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
-    """Format, number of vertices and their fields; the vertex element must come first, as it always does."""
-    form, count, fields, element = "", 0, [], ""
-    for line in lines:
-        words = line.split()
-        if words[:1] == ["format"]:
-            form = words[1]
-        elif words[:1] == ["element"]:
-            if not element and words[1] != "vertex":
-                raise ValueError(f"its first element is {words[1]}, not vertex")
-            element = words[1]
-            count = int(words[2]) if element == "vertex" else count
-        elif words[:1] == ["property"] and element == "vertex":
-            fields.append((words[-1], _NUMPY_TYPE[words[1]]))
-    return form, count, fields
+            vertices = np.frombuffer(data, header.record, header.vertices, header.size)
+    except (ValueError, OverflowError) as error:
+        raise RecordingError(f"{path} cannot be read as a PLY file: {error}") from error
+    return header, vertices

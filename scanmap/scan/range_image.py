@@ -127,8 +127,9 @@ class Scan:
     @property
     def origins(self) -> F64:
         """(B, 3) the head's origin, where the laser stands, in the world frame [m]."""
-        T = [self.mount.T_world_head(float(b)) for b in self.bearings]
-        return np.array([t[:3, 3] for t in T]).reshape(-1, 3)
+        x, y, z = self.mount.offset_m
+        c, s = np.cos(self.bearings), np.sin(self.bearings)
+        return np.stack([c * x - s * y, s * x + c * y, np.full(len(c), z)], axis=-1)
 
     @classmethod
     def from_arrays(

@@ -1,4 +1,4 @@
-"""The surface of a range image: outliers removed, normals, triangles. All of it image operations.
+"""The surface of a range image: outliers removed, and normals, by image operations.
 
 The functions want a scan whose bearings ascend (`Scan.merged`); a scan of a full turn closes on itself.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import Reason
-from scanmap.scan.links import Disparity, bearing_links, blocks, disparity, row_links
+from scanmap.scan.links import Disparity, bearing_links, blocks, depth_edge_slope, disparity, row_links
 from scanmap.scan.range_image import Scan, ScanParams
 
 F32 = NDArray[np.float32]
@@ -34,7 +34,7 @@ def unsupported(scan: Scan, params: ScanParams) -> Mask:
     """(B, H) cells with a point that no neighbour supports."""
     halo = 2
     d = disparity(scan, params, halo)
-    reach = _reach(params)
+    reach = depth_edge_slope(params)
     lonely = np.zeros((len(scan), scan.rows), bool)
     for block in blocks(len(scan), scan.rows):
         wide = slice(block.start, block.stop + 2 * halo)
@@ -78,7 +78,7 @@ def normals(scan: Scan, params: ScanParams | None = None) -> F32:
         wide = slice(block.start, block.stop + 2 * halo)
         points = np.ascontiguousarray(np.moveaxis(scan.points[order[wide]], -1, 0))
         points[:, np.isnan(d.q[wide])] = np.nan
-        patch = _patch_normals(points, d, wide, _reach(params), along, down)[:, halo:-halo]
+        patch = _patch_normals(points, d, wide, depth_edge_slope(params), along, down)[:, halo:-halo]
         view = origins[block].T[:, :, None] - points[:, halo:-halo]
         patch *= np.copysign(np.float32(1.0), (patch * view).sum(axis=0))
         result[block] = np.moveaxis(patch, 0, -1)
@@ -154,7 +154,3 @@ def _shifted(values: NDArray[Any], offset: int, axis: int, beyond: float | bool)
     source[axis] = slice(max(0, offset), size - max(0, -offset))
     result[tuple(to)] = values[tuple(source)]
     return result
-
-
-def _reach(params: ScanParams) -> float:
-    return float(np.tan(np.radians(params.max_incidence_deg)))
