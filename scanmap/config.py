@@ -112,14 +112,16 @@ def parse(text: str, source: str, settings: Iterable[str] = (), folder: Path | N
         _apply(document, setting)
     if isinstance(document.setdefault("laserline", {}), dict):
         document["laserline"].setdefault("pool_rows", POOL_ROWS)
+    # Where a key has no bounds, NaN would pass as a number.
+    faults = {f"{path} = {value}: must be a finite number" for path, value in _not_finite(document)}
     try:
         # By way of JSON, strictly: a TOML array is a tuple, but text is never taken for a number.
-        return Config.model_validate_json(json.dumps(document, default=str), strict=True)
+        config = Config.model_validate_json(json.dumps(document, default=str), strict=True)
     except ValidationError as error:
-        faults = sorted({_fault(detail, document) for detail in error.errors()})
-        raise ConfigError(
-            f"{source}: " + "; ".join(faults) + ". `scanmap config` lists every key with its meaning"
-        ) from error
+        faults |= _faults(error)
+    if faults:
+        raise ConfigError(f"{source}: {'; '.join(sorted(faults))}. `scanmap config` lists every key with its meaning")
+    return config
 
 
 def _presets() -> Any:
@@ -156,35 +158,67 @@ def _apply(document: dict[str, Any], setting: str) -> None:
         table[path[-1]] = value.strip()
 
 
-def _fault(detail: ErrorDetails, document: Mapping[str, Any]) -> str:
-    """One fault in words: path, the bad value, what is allowed."""
-    path = tuple(part for part in detail["loc"] if not (isinstance(part, str) and part in ("str", "CalibrationFile")))
-    where = ".".join(str(part) for part in path) or "configuration"
-    if detail["type"] == "extra_forbidden":
-        return f"{where} is no key here; valid: {', '.join(_keys_beside(path))}"
-    message = detail["msg"].removeprefix("Value error, ")
-    if detail["type"] == "missing" or isinstance(detail["input"], dict):
-        return f"{where}: {message}"
-    return f"{where} = {detail['input']!r}: {message}"
+def _not_finite(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Path and value of every number in a document that is NaN or infinite."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    elif isinstance(value, dict | list):
+        for key, below in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _not_finite(below, f"{path}.{key}" if path else str(key))
 
 
-def _keys_beside(path: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = Config
-    for part in path[:-1]:
-        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
-        candidates = [annotation, *get_args(annotation)]
-        models = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
-        if not models:
-            break
-        model = models[0]
-    return list(model.model_fields)
+def _faults(error: ValidationError) -> set[str]:
+    """Every fault in words: path, the bad value, what is allowed; the choices of one key in one."""
+    extra: set[str] = set()
+    wrong: dict[str, tuple[str, list[str]]] = {}
+    for detail in error.errors():
+        path, valid = _path_and_keys(detail["loc"])
+        where = ".".join(path) or "configuration"
+        message = detail["msg"].removeprefix("Value error, ")
+        if detail["type"] == "extra_forbidden":
+            extra.add(f"{where} is no key here; valid: {', '.join(valid)}")
+        elif isinstance(detail["input"], float) and not math.isfinite(detail["input"]):
+            continue  # said already, and better
+        elif isinstance(detail["input"], dict) and detail["type"] == "string_type":
+            continue  # a table was meant, and its own faults are named
+        else:
+            shown = detail["type"] != "missing" and not isinstance(detail["input"], dict)
+            at = f"{where} = {detail['input']!r}" if shown else where
+            wrong.setdefault(where, (at, []))[1].append(message)
+    return extra | {f"{at}: {', or '.join(dict.fromkeys(messages))}" for at, messages in wrong.values()}
+
+
+def _path_and_keys(loc: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
+    """A fault's path without pydantic's names for the branches of a union, and the keys valid where it ends."""
+    path: list[str] = []
+    table: type[BaseModel] | None = Config
+    valid = list(Config.model_fields)
+    for part in loc:
+        own = table.model_fields.get(str(part)) if table is not None else None
+        if own is None and _is_branch(part):
+            continue
+        path.append(str(part))
+        valid = list(table.model_fields) if table is not None else valid
+        table = _table_of(own) if own is not None else None
+    return path, valid
+
+
+def _is_branch(part: int | str) -> bool:
+    """Whether pydantic made this part of a path up: the type tried, as in `sweep.passes.int`."""
+    return part in ("str", "int", "float", "bool", CalibrationFile.__name__) or "[" in str(part)
+
+
+def _table_of(info: FieldInfo) -> type[BaseModel] | None:
+    """The model of a field that is a table, or may be one."""
+    candidates = (info.annotation, *get_args(info.annotation))
+    return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
 
 
 def _explain(model: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
     """TOML lines of one table: plain keys first, as TOML wants it, then the tables below."""
     import tomli_w
 
-    tables = []
+    tables, left_out = [], []
     for name, info in type(model).model_fields.items():
         value = getattr(model, name)
         if isinstance(value, BaseModel):
@@ -192,17 +226,32 @@ def _explain(model: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
             continue
         note = "".join((info.description or "", _limits(info)))
         if value is None or value == {}:
-            yield f"# {name} =  # {note}"
+            left_out.append((name, info))
             continue
         plain = model.model_dump(mode="json", include={name})[name]
         line = tomli_w.dumps({name: plain}).strip()
         yield f"{_one_line(line)}  # {note}" if note else _one_line(line)
+    for name, info in left_out:
+        yield from _explain_left_out(name, info, path)
     for name, value, info in tables:
         yield ""
         about = info.description or (type(value).__doc__ or "").strip().splitlines()[0]
         yield f"# {about}"
         yield f"[{'.'.join((*path, name))}]"
         yield from _explain(value, (*path, name))
+
+
+def _explain_left_out(name: str, info: FieldInfo, path: tuple[str, ...]) -> Iterator[str]:
+    """The same of a key or table that is not there: as comments, ready to be filled in."""
+    table = _table_of(info)
+    note = "".join((info.description or "", _limits(info)))
+    if table is None or note:
+        yield f"# {name} =  # {note or 'a table, written by the solvers'}"
+    if table is None:
+        return
+    yield f"# [{'.'.join((*path, name))}]  # {(table.__doc__ or '').strip().splitlines()[0]}"
+    for key, below in table.model_fields.items():
+        yield f"#   {key} =  # {below.description or ''}{_limits(below)}"
 
 
 def _one_line(toml: str) -> str:

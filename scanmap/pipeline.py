@@ -21,6 +21,9 @@ from scanmap.shot import Decoded, Shot, decode_image
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
 
 
+CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
+
+
 class Step(NamedTuple):
     """One shot, and what was made of it."""
 
@@ -76,21 +79,29 @@ class Pipeline:
 
 
 def checked(shots: Iterable[Shot], calibration: Calibration) -> Iterator[Shot]:
-    """The same shots, after the first readable image was held against the calibration.
+    """The same shots, after the first readable images were held against the calibration.
+
+    One that fits is enough: a single odd image costs its own shot, not the scan.
 
     Raises:
         CalibrationError: the images have another size than the calibration; before anything is processed.
     """
     source = iter(shots)
-    seen = []
+    seen: list[Shot] = []
+    odd: list[tuple[int, int]] = []
     for shot in source:
         seen.append(shot)
         try:
             height, width = decode_image(shot.image, grey=True).image.shape[:2]
         except CameraError:
             continue
-        calibration.check_image(width, height)
-        break
+        if (width, height) == (calibration.intrinsics.width, calibration.intrinsics.height):
+            return chain(seen, source)
+        odd.append((width, height))
+        if len(odd) == CHECKED_IMAGES:
+            break
+    if odd:
+        calibration.check_image(*odd[0])
     return chain(seen, source)
 
 

@@ -6,6 +6,8 @@ nothing of devices or clocks. Images stay encoded, as the camera sent them, unti
 
 from __future__ import annotations
 
+import re
+import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,6 +21,10 @@ Image = NDArray[np.uint8]
 
 JPEG_MAGIC = b"\xff\xd8\xff"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+JPEG_END = b"\xff\xd9"
+
+# Many webcams leave a few stray bytes before a restart marker; the decoder finds its way back there.
+HARMLESS_BYTES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +63,21 @@ def decode_image(data: bytes, *, grey: bool = False) -> Decoded:
     Raises:
         CameraError: nothing could be decoded.
 
-    A JPEG that was cut short is decoded down to the cut; `rows_valid` says how far.
+    A JPEG that was cut short is decoded down to the cut; `rows_valid` says how far. One that is damaged
+    inside is refused: nobody knows from which row on it is wrong.
     """
-    if image_format(data) == "jpeg":
+    kind = image_format(data)
+    if kind == "jpeg":
         return _decode_jpeg(data, grey)
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    refusal = f"image cannot be decoded: {len(data)} bytes, neither a whole JPEG nor PNG"
+    if not data or (kind == "png" and not _is_whole_png(data)):
+        raise CameraError(refusal)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    except cv2.error as error:  # larger than OpenCV takes
+        raise CameraError(refusal) from error
     if pixels is None:
-        raise CameraError(f"image cannot be decoded: {len(data)} bytes, neither a whole JPEG nor PNG")
+        raise CameraError(refusal)
     return Decoded(np.asarray(pixels, np.uint8), pixels.shape[0])
 
 
@@ -82,13 +96,36 @@ def _decode_jpeg(data: bytes, grey: bool) -> Decoded:
     try:
         pixels = simplejpeg.decode_jpeg(data, colorspace=colourspace)
         rows = pixels.shape[0]
-    except ValueError:
+    except ValueError as warning:
         try:
             pixels = simplejpeg.decode_jpeg(data, colorspace=colourspace, strict=False)
         except ValueError as error:
             raise CameraError(f"JPEG of {len(data)} bytes cannot be decoded: {error}") from error
-        rows = _rows_before_fill(pixels)
+        rows = _rows_of_damaged_jpeg(data, pixels, str(warning))
     return Decoded(np.asarray(pixels[:, :, 0] if grey else pixels), rows)
+
+
+def _rows_of_damaged_jpeg(data: bytes, pixels: Image, warning: str) -> int:
+    """How many rows to believe of a JPEG the decoder warned of; CameraError if none."""
+    if JPEG_END not in data[-16:]:
+        return _rows_before_fill(pixels)
+    stray = re.search(r"(\d+) extraneous bytes", warning)
+    if stray is None or int(stray[1]) > HARMLESS_BYTES:
+        raise CameraError(f"JPEG of {len(data)} bytes is damaged inside: {warning}")
+    return pixels.shape[0]
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether every chunk is there and has its CRC; libpng would complain on stderr past every handler."""
+    at = len(PNG_MAGIC)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big") or end + 4 > len(data):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
 
 
 def _rows_before_fill(pixels: Image) -> int:

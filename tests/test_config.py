@@ -83,8 +83,8 @@ def test_missing_configuration_names_the_presets() -> None:
 
 
 def test_broken_toml_names_the_line() -> None:
-    with pytest.raises(ConfigError, match="line 1"):
-        parse("[sweep", "rig.toml")
+    with pytest.raises(ConfigError, match="line 2"):
+        parse("[sweep]\nstep_deg = = 1\n", "rig.toml")
 
 
 def test_calibration_path_counts_from_the_file(tmp_path, monkeypatch) -> None:
