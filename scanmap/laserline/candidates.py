@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
 
 BLOCK = 4  # rows summed into one: a quarter of the search, twice the signal to noise
 COUNT = 3  # candidates per block
@@ -17,6 +18,7 @@ COUNT = 3  # candidates per block
 # at full, half and quarter resolution, for lines of sigma 0.7 to 8 px.
 _CENTRE, _AWAY = 5, 7
 _MARGIN = 48  # [px] what the filter needs beside the window at quarter resolution; divisible by 4
+_COLOURLESS = 240  # [grey levels] from here on a sample has no colour
 _APART = 14  # [px] two candidates are at least this far apart: nearer ones are one line in two filters
 _CONNECTED_PX = 9.0  # a line does not run farther than this from block to block
 _JUMP = 1.6  # what leaving a line costs, in logarithms of signal to noise
@@ -41,13 +43,14 @@ def noise_of(plane: U8) -> float:
     return float(max(median / 0.954, 0.3))
 
 
-def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Candidates:
+def find_candidates(plane: U8, window: NDArray[np.float64], noise: float, other: U8 | None = None) -> Candidates:
     """The strongest narrow bright places of each block of rows.
 
     Args:
         plane: (H, W).
         window: (H, 2) first and last column of each row, NaN where a row can have no line.
         noise: standard deviation of a sample [grey levels].
+        other: (H, W) a channel in which the laser hardly shows; what stands out there too is a thing, not the line.
 
     The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
     have a bright side and score nothing.
@@ -57,7 +60,15 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Can
     first, last = _block_window(window, blocks)
     low = max(0, int(np.nanmin(first)) - _MARGIN)
     high = min(width, int(np.nanmax(last)) + _MARGIN + 1)
-    response = _response(_summed(plane[:, low:high], blocks))
+    own = _by_block(plane[:, low:high], blocks)
+    if other is None:
+        response = _response(own.sum(axis=1, dtype=np.uint16), None, None)
+    else:
+        elsewhere = _by_block(other[:, low:high], blocks).sum(axis=1, dtype=np.uint16)
+        # A saturated core says nothing of its colour, nor do the columns beside it that optics and chroma blur.
+        saturated = (own.max(axis=1) >= _COLOURLESS).view(np.uint8)
+        saturated = np.asarray(cv2.dilate(saturated, np.ones((1, 9), np.uint8)), np.uint8)
+        response = _response(own.sum(axis=1, dtype=np.uint16), elsewhere, saturated)
     x = np.arange(low, high, dtype=np.float32)
     if (np.nanmax(first) - np.nanmin(first) > 1) or (np.nanmax(last) - np.nanmin(last) > 1) or np.isnan(first).any():
         outside = (x < first[:, None]) | (x > last[:, None]) | np.isnan(first)[:, None]
@@ -80,7 +91,7 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float) -> Can
 
 
 def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) -> F32:
-    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, down to 0.1 for another.
+    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, down to 0 for another.
 
     Args:
         image: (H, W, 3).
@@ -88,30 +99,32 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
         noise: standard deviation of a sample [grey levels].
 
     The laser's colour is measured from the strongest candidates, as the height of the line in the other
-    channels over its height in its own. A candidate is in doubt when another channel rises above that by more
-    than noise explains. Where its own channel is saturated, colour says nothing.
+    channels over its height in its own: the light is of one colour, so whatever it falls on, that share stays. A
+    candidate is in doubt when another channel rises above it by more than noise explains. Where its own channel is
+    saturated, colour says nothing.
     """
     rows = np.minimum(np.arange(len(candidates.column)) * BLOCK, len(image) - BLOCK)
     middle = np.clip(candidates.column.astype(np.intp), 0, image.shape[1] - 1)
     core, side = np.zeros((2, *middle.shape, 3), np.float32)
-    for place, offsets in ((core, (-1, 0, 1)), (side, (-9, -8, 8, 9))):
+    for place, offsets in ((core, range(-2, 3)), (side, (-9, -8, 8, 9))):
         for offset in offsets:
             x = np.clip(middle + offset, 0, image.shape[1] - 1)
             for row in range(BLOCK):
                 place[:] += image[rows[:, None] + row, x]
-    height = core / (3 * BLOCK) - side / (4 * BLOCK)
+    height = core / (5 * BLOCK) - side / (4 * BLOCK)
     own = np.maximum(height[..., channel], 1.0)
     other = np.delete(height, channel, axis=-1).max(axis=-1)
-    saturated = core[..., channel] / (3 * BLOCK) >= 235.0
+    saturated = image[rows[:, None] + BLOCK // 2, middle, channel] >= 245
     strong = ~saturated & (candidates.snr > 20.0)
     if strong[:, 0].sum() < 8:
         return np.ones_like(candidates.snr)
     share, weight = (other / own)[strong], np.minimum(candidates.snr[strong], 100.0)
     order = np.argsort(share)
     laser = float(share[order][np.searchsorted(np.cumsum(weight[order]), 0.3 * weight.sum())])
-    excess = other - (max(laser, 0.0) + 0.25) * own
+    # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
+    excess = other - (max(laser, 0.0) + 0.35) * own
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
-    doubt = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.25 * own), 0.1, 1.0)
+    doubt = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.25 * own), 0.0, 1.0)
     return np.where(saturated, 1.0, doubt).astype(np.float32)
 
 
@@ -217,28 +230,44 @@ def _block_window(window: NDArray[np.float64], blocks: int) -> tuple[NDArray[np.
     return first, last
 
 
-def _summed(plane: U8, blocks: int) -> NDArray[np.uint16]:
+def _by_block(plane: U8, blocks: int) -> U8:
+    """(B, BLOCK, W): the rows by blocks, the last one filled up with the last row."""
     height, width = plane.shape
     if height % BLOCK:
         plane = np.concatenate([plane, np.repeat(plane[-1:], blocks * BLOCK - height, axis=0)])
-    summed: NDArray[np.uint16] = plane.reshape(blocks, BLOCK, width).sum(axis=1, dtype=np.uint16)
-    return summed
+    return plane.reshape(blocks, BLOCK, width)
 
 
-def _response(summed: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Largest response of the filter at full, half and quarter resolution, each scaled to the same noise."""
-    best = _line_filter(summed)
-    height, width = summed.shape
-    level = summed
+def _response(own: U16, other: U16 | None, saturated: U8 | None) -> U16:
+    """Largest response of the filter at full, half and quarter resolution.
+
+    In grey levels, not in units of noise: what competes with the line is the room, not noise, and the room has more
+    of everything the wider it is looked at.
+    """
+    best = _line_filter(own, other, saturated)
+    height, width = own.shape
     for k in (1, 2):
-        level = np.asarray(cv2.resize(level, (-(-width // 2**k), height), interpolation=cv2.INTER_AREA), np.uint16)
-        response = cv2.multiply(_line_filter(level), float(np.sqrt(2.0**k)))  # type: ignore[call-overload]
+        size = (-(-width // 2**k), height)
+        own = np.asarray(cv2.resize(own, size, interpolation=cv2.INTER_AREA), np.uint16)
+        if other is not None and saturated is not None:
+            other = np.asarray(cv2.resize(other, size, interpolation=cv2.INTER_AREA), np.uint16)
+            saturated = np.asarray(cv2.resize(saturated, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        response = _line_filter(own, other, saturated)
         cv2.max(best, cv2.resize(response, (width, height), interpolation=cv2.INTER_NEAREST), best)
     return best
 
 
-def _line_filter(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Mean over the line's width minus the brighter of its two sides, at least 0."""
+def _line_filter(own: U16, other: U16 | None, saturated: U8 | None) -> U16:
+    """Mean over the line's width minus the brighter of its two sides, at least 0; less what the other channel has."""
+    response = _stands_out(own)
+    if other is None or saturated is None:
+        return response
+    elsewhere = _stands_out(other)
+    elsewhere[saturated > 0] = 0
+    return np.asarray(cv2.subtract(response, cv2.addWeighted(elsewhere, 1.25, elsewhere, 0.0, 0.0)), np.uint16)
+
+
+def _stands_out(values: U16) -> U16:
     mean = cv2.blur(values, (_CENTRE, 1), borderType=cv2.BORDER_REPLICATE)
     padded = cv2.copyMakeBorder(mean, 0, 0, _AWAY, _AWAY, cv2.BORDER_REPLICATE)
     side = cv2.max(padded[:, : -2 * _AWAY], padded[:, 2 * _AWAY :])

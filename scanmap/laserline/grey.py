@@ -28,7 +28,9 @@ Grey = Literal[
     "ycbcr_cb",
 ]
 
-_CHANNEL = {"blue": 0, "green": 1, "red": 2}
+# The channel a laser of one colour shows in least, among those next to it: blue, green and red lasers.
+NEIGHBOUR = (1, 2, 1)
+CHANNEL = {"blue": 0, "green": 1, "red": 2}
 # Weights of blue, green, red.
 _WEIGHTS = {
     "mean": (1 / 3, 1 / 3, 1 / 3),
@@ -55,13 +57,13 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
     if image.ndim == 2:
         return image
     if grey == "auto":
-        return _extract(image, laser_channel(image) if channel is None else channel)
-    if grey in _CHANNEL:
-        return _extract(image, _CHANNEL[grey])
+        return extract(image, laser_channel(image) if channel is None else channel)
+    if grey in CHANNEL:
+        return extract(image, CHANNEL[grey])
     if grey in _WEIGHTS:
         return np.asarray(cv2.transform(image, np.array([_WEIGHTS[grey]], np.float32)), np.uint8)
     if grey in _YCRCB:
-        return _extract(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), np.uint8), _YCRCB[grey])
+        return extract(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), np.uint8), _YCRCB[grey])
     if grey == "bit_index":
         return _bits(image, bit_index)
     if grey == "red_gain":
@@ -129,17 +131,18 @@ def overlay(plane: U8, column_px: NDArray[np.floating], colour: Literal["red", "
     painted = np.asarray(cv2.cvtColor(plane, cv2.COLOR_GRAY2BGR), np.uint8)
     rows = np.flatnonzero(np.isfinite(column_px))
     columns = np.clip(np.rint(column_px[rows]), 0, plane.shape[1] - 1).astype(np.intp)
-    painted[rows, columns] = np.eye(3, dtype=np.uint8)[_CHANNEL[colour]] * 255
+    painted[rows, columns] = np.eye(3, dtype=np.uint8)[CHANNEL[colour]] * 255
     return painted
 
 
-def _extract(image: U8, channel: int) -> U8:
+def extract(image: U8, channel: int) -> U8:
+    """One channel (H, W) of a BGR image."""
     return np.asarray(cv2.extractChannel(image, channel), np.uint8)
 
 
 def _bits(image: U8, n: int) -> U8:
     if n % 8 == 0 and n <= 16:
-        return _extract(image, n // 8)
+        return extract(image, n // 8)
     word = image[..., 0].astype(np.uint32)
     word |= image[..., 1].astype(np.uint32) << 8
     word |= image[..., 2].astype(np.uint32) << 16

@@ -5,17 +5,22 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from scanmap.laserline.candidates import choose_path, colour_doubt, columns_of_rows, find_candidates, noise_of
-from scanmap.laserline.grey import Grey, laser_channel, to_grey, without_background
-from scanmap.laserline.peaks import SATURATED, Peaks, centre_of_gravity, fit_gaussian
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, laser_channel, to_grey, without_background
+from scanmap.laserline.peaks import SATURATED, Peaks, bright_core, centre_of_gravity, fit_gaussian
 from scanmap.laserline.pooling import pool
 
 Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+
+# What a core must stand out by where no profile could be fitted: in noise, and in grey levels.
+_CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 
 
 class Reason(IntEnum):
@@ -110,7 +115,9 @@ def find_laser_line(
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
     """
-    channel = laser_channel(image) if image.ndim == 3 and params.grey == "auto" else None
+    channel = CHANNEL.get(params.grey) if image.ndim == 3 else None
+    if image.ndim == 3 and params.grey == "auto":
+        channel = laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
     plane = to_grey(image, params.grey, params.bit_index, channel)
     if params.method == "brightest":
         return _brightest(plane, params, window)
@@ -124,14 +131,16 @@ def find_laser_line(
     if not np.isfinite(window).any():
         return _nothing(len(plane), Reason.WINDOW)
     noise = noise_of(lit)
-    candidates = find_candidates(lit, window, noise)
+    other = None if channel is None or background is not None else extract(image, NEIGHBOUR[channel])
+    candidates = find_candidates(lit, window, noise, other)
     score = candidates.snr
-    if channel is not None:
+    if channel is not None and background is None:
         score = score * colour_doubt(image, channel, candidates, noise)
     path = choose_path(candidates, score, params.min_snr)
     row, column = columns_of_rows(lit, path, window)
-    line = _located(plane, lit, row, column, params)
+    line = _located(plane, lit, (row, column), noise, params)
     line = _within(line, window)
+    line = _without_blobs(line)
     line = _without_crumbs(line)
     if params.pool_rows >= 3:
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
@@ -139,33 +148,54 @@ def find_laser_line(
     return line
 
 
-def _located(plane: U8, lit: U8, row: NDArray[np.intp], column: NDArray[np.intp], params: LaserLineParams) -> LaserLine:
+def _located(
+    plane: U8, lit: U8, at: tuple[NDArray[np.intp], NDArray[np.intp]], noise: float, params: LaserLineParams
+) -> LaserLine:
     """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows."""
     height, width = plane.shape
     line = _nothing(height, Reason.WEAK)
+    row, column = at
     if not row.size:
         return line
-    for wide, at in _by_width(lit, row, column):
-        if not at.size:
+    for wide, some in _by_width(lit, row, column):
+        if not some.size:
             continue
-        r, c = row[at], column[at]
+        r, c = row[some], column[some]
         x = c[:, None] + np.arange(-wide, wide + 1)
         outside = (x < 0) | (x >= width)
         x = np.clip(x, 0, width - 1)
         y = lit[r[:, None], x].astype(np.float32)
         saturated = (plane[r[:, None], x] >= SATURATED) | outside
-        peaks = fit_gaussian(y, saturated, params.noise)
+        peaks = fit_gaussian(y, saturated, noise, params.noise)
         offset = centre_of_gravity(y) if params.method == "cog" else peaks.offset_px
-        reason = _judged(peaks, params)
+        reason = _judged(peaks, noise, params)
+        if params.method == "gauss":
+            _take_cores(line, r, c, y, reason, noise)
         # An edge that cuts the line shows as an odd residual; what it may have moved the column by is added.
         bias = 0.5 * peaks.width_px * np.maximum(np.abs(peaks.asymmetry) - 0.05, 0.0)
-        line.column_px[r], line.peak[r], line.width_px[r] = c + offset, peaks.height, peaks.width_px
-        line.sigma_px[r] = np.hypot(peaks.sigma_px, bias)
-        line.reason[r] = reason
-        lost = r[reason != Reason.OK]
-        for values in line[:4]:
-            values[lost] = np.nan
+        good = reason == Reason.OK
+        at_good = r[good]
+        line.column_px[at_good], line.peak[at_good] = (c + offset)[good], peaks.height[good]
+        line.width_px[at_good], line.sigma_px[at_good] = peaks.width_px[good], np.hypot(peaks.sigma_px, bias)[good]
+        rest = r[~good & (line.reason[r] != Reason.OK)]
+        line.reason[at_good] = Reason.OK
+        line.reason[rest] = reason[~good & (line.reason[r] != Reason.OK)]
     return line
+
+
+def _take_cores(
+    line: LaserLine, row: NDArray[np.intp], column: NDArray[np.intp], y: F32, reason: NDArray[np.uint8], noise: float
+) -> None:
+    """Where the profile is no Gaussian but has a core that stands out sharply, take the core."""
+    at = np.flatnonzero(reason != Reason.OK)
+    if not at.size:
+        return
+    cores = bright_core(y[at])
+    sharp = (cores.contrast > max(_CORE_SNR * noise, _CORE_CONTRAST)) & (np.abs(cores.offset_px) < 3.0)
+    r = row[at[sharp]]
+    line.column_px[r] = column[at[sharp]] + cores.offset_px[sharp]
+    line.peak[r], line.width_px[r] = cores.contrast[sharp], cores.width_px[sharp]
+    line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
 
 
 def _by_width(lit: U8, row: NDArray[np.intp], column: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
@@ -173,13 +203,14 @@ def _by_width(lit: U8, row: NDArray[np.intp], column: NDArray[np.intp]) -> list[
     reach = 24
     x = np.clip(column[:, None] + np.arange(-reach, reach + 1), 0, lit.shape[1] - 1)
     y = lit[row[:, None], x]
-    floor = np.minimum(y[:, :4].mean(axis=1), y[:, -4:].mean(axis=1))
     top = y[:, reach - 1 : reach + 2].mean(axis=1)
-    above = y > (0.5 * (floor + top))[:, None]
+    # The brighter side counts: beside an edge of the room the run would never end at the darker one's level.
+    sides = np.maximum(y[:, 4:12].mean(axis=1), y[:, -12:-4].mean(axis=1))
+    above = y > (0.5 * (np.minimum(sides, top - 2.0) + top))[:, None]
     # Width of the run above half height that holds the middle.
     left = (~above[:, reach::-1]).argmax(axis=1)
     right = (~above[:, reach:]).argmax(axis=1)
-    full = np.where(above.all(axis=1), 2 * reach, left + right - 1)
+    full = np.where(above.all(axis=1), 2 * reach, np.maximum(left + right - 1, 0))
     limits = ((8, 6), (13, 11), (24, 200))  # half window, largest full width at half height
     found, lower = [], -1
     for half, upper in limits:
@@ -188,15 +219,17 @@ def _by_width(lit: U8, row: NDArray[np.intp], column: NDArray[np.intp]) -> list[
     return found
 
 
-def _judged(peaks: Peaks, params: LaserLineParams) -> NDArray[np.uint8]:
+def _judged(peaks: Peaks, noise: float, params: LaserLineParams) -> NDArray[np.uint8]:
     """Reason (N,) of each fit."""
     reason = np.full(len(peaks.height), Reason.OK, np.uint8)
-    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / peaks.noise
+    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / max(noise, 1.0)
     reason[np.abs(peaks.offset_px) > 3.0 + 0.7 * peaks.width_px] = Reason.AMBIGUOUS
     reason[peaks.sigma_px > 1.5] = Reason.WEAK
+    # A dim bump whose samples scatter far more than the sensor's do is texture of the room.
+    reason[(peaks.noise > 2.5 * max(noise, 1.5)) & (peaks.height < 3.5 * peaks.noise)] = Reason.AMBIGUOUS
     reason[(snr < params.min_snr) | (peaks.height < params.min_peak)] = Reason.WEAK
     reason[peaks.width_px > params.max_width_px] = Reason.WIDE
-    reason[peaks.width_px < 0.5] = Reason.NARROW
+    reason[peaks.width_px < 0.33] = Reason.NARROW
     return reason
 
 
@@ -209,12 +242,31 @@ def _within(line: LaserLine, window: Array) -> LaserLine:
     return _lost(line, outside, Reason.WINDOW)
 
 
+def _without_blobs(line: LaserLine) -> LaserLine:
+    """Give up rows far wider across the line than the sharpest good part of it, unless near and therefore bright.
+
+    One beam has one width, which grows toward near things as the light does; what is wide and dim is a thing in
+    the room. The width across a slanted line is its width in the row times the cosine of the slant.
+    """
+    strong = np.isfinite(line.column_px) & (line.peak > 10.0 * line.sigma_px)
+    if strong.sum() < 20:
+        return line
+    slope = np.gradient(np.nan_to_num(line.column_px, nan=-1e4))
+    across = line.width_px / np.sqrt(1.0 + np.clip(slope, -4.0, 4.0) ** 2)
+    sharp = np.percentile(across[strong], 40)
+    with np.errstate(invalid="ignore"):
+        blob = (across > 2.2 * sharp + 0.5) & (line.peak < 140.0)
+    return _lost(line, blob, Reason.WIDE)
+
+
 def _without_crumbs(line: LaserLine) -> LaserLine:
-    """Give up runs of fewer than three rows that no neighbour on either side continues."""
+    """Give up short runs of rows that no neighbour on either side continues: 3 rows always, 10 rows if weak."""
     column = line.column_px
     linked = np.abs(np.diff(column)) < 3.0
     number = np.concatenate([[0], np.cumsum(~linked)])
-    lonely = np.isfinite(column) & (np.bincount(number)[number] < 3)
+    rows = np.bincount(number)
+    weak = np.bincount(number, np.nan_to_num(line.sigma_px, nan=0.0)) > 0.2 * rows
+    lonely = np.isfinite(column) & ((rows < 4) | (weak & (rows < 12)))[number]
     return _lost(line, lonely, Reason.AMBIGUOUS)
 
 

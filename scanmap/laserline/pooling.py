@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 # How far two neighbouring rows' columns may differ beyond the line's own slope: in sigmas, and at least [px].
 _BREAK_SIGMA, _BREAK_PX = 6.0, 0.35
 # A quadratic that misses its own rows by more than this (reduced chi^2) is not what the surface is.
-_MISFIT = 2.2
+_MISFIT = 4.5
 
 
 def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
