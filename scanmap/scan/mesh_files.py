@@ -1,12 +1,15 @@
-"""Mesh files of a scan: binary STL and PLY, and GLB and OBJ by trimesh. Metres, z up (GLB: y up, as glTF wants it)."""
+"""Mesh files of a scan: binary STL, PLY and GLB, and OBJ by trimesh. Metres, z up (GLB: y up, as glTF wants it)."""
 
 from __future__ import annotations
 
+import json
+import struct
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.errors import RecordingError
 from scanmap.scan.mesh import Mesh, mesh
 from scanmap.scan.ply import comment_lines
 from scanmap.scan.range_image import Scan, ScanParams
@@ -18,23 +21,28 @@ _PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _PLY_VERTEX_LINES = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     f"property uchar {name}" for name in ("red", "green", "blue")
 ]
-# glTF's x y z from x forward, y left, z up: a viewer turns it back by the same rule.
-_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def write_stl(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
     """Binary STL; its 80 free bytes say where the scan comes from."""
-    surface = mesh(scan, params)
-    facets = np.zeros(len(surface.triangles), _STL_FACET)
-    facets["corners"] = surface.vertices[surface.triangles]
-    a, b, c = (facets["corners"][:, k] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    facets["normal"] = normal / np.where(length > 0, length, 1.0)
+    surface, _ = _compact(scan, params)
     about = f"scanmap mesh, metres; source: {scan.comments.get('source', 'scan')}"
     file.write(about.encode("ascii", "replace")[:80].ljust(80))
-    file.write(np.uint32(len(facets)).tobytes())
-    file.write(facets.data)
+    file.write(struct.pack("<I", len(surface.triangles)))
+    for start in range(0, len(surface.triangles), 65536):
+        file.write(_facets(surface.vertices[surface.triangles[start : start + 65536]]).data)
+
+
+def _facets(corners: NDArray[np.float32]) -> NDArray[Any]:
+    """STL records of triangles (N, 3 corners, 3)."""
+    edge = np.moveaxis(corners[:, 1:] - corners[:, :1], -1, 0)
+    a, b = edge[..., 0], edge[..., 1]
+    normal = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], axis=-1)
+    length = np.sqrt((normal * normal).sum(axis=-1, keepdims=True))
+    facets = np.zeros(len(corners), _STL_FACET)
+    facets["normal"] = normal / np.where(length > 0, length, 1.0)
+    facets["corners"] = corners
+    return facets
 
 
 def write_mesh_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
@@ -55,35 +63,77 @@ def write_mesh_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None)
 
 
 def write_glb(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
-    """Binary glTF: y up, normals, grey vertices; the scan's comments are the mesh's `extras`."""
-    built = _trimesh(scan, params)
-    built.apply_transform(_Y_UP)
-    file.write(built.export(file_type="glb", include_normals=True))
+    """Binary glTF 2.0: y up, normals, grey vertices; the scan's comments are the mesh's `extras`.
+
+    Source: Khronos Group, glTF 2.0 specification, section 4 (GLB) and 3.7 (meshes).
+    """
+    surface, used = _compact(scan, params)
+    grey = _greys(scan)[used]
+    opaque = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1)
+    vertices, normal = _y_up(surface.vertices), _y_up(_normals(scan, params)[used])
+    # Every array is a view of the one buffer, a multiple of four bytes long: no padding between them.
+    arrays: list[NDArray[Any]] = [surface.triangles.astype("<u4").ravel(), vertices, normal, opaque]
+    offsets = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    kinds = ((5125, "SCALAR", 34963), (5126, "VEC3", 34962), (5126, "VEC3", 34962), (5121, "VEC4", 34962))
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": k, "componentType": component, "type": kind, "count": len(arrays[k])}
+        for k, (component, kind, _) in enumerate(kinds)
+    ]
+    accessors[3]["normalized"] = True
+    if len(vertices):
+        accessors[1] |= {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    attributes = {"POSITION": 1, "NORMAL": 2, "COLOR_0": 3}
+    document = {
+        "asset": {"version": "2.0", "generator": "scanmap"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [{"attributes": attributes, "indices": 0, "mode": 4}],
+                "extras": {str(key): str(value) for key, value in scan.comments.items()},
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": offsets[k], "byteLength": arrays[k].nbytes, "target": target}
+            for k, (_, _, target) in enumerate(kinds)
+        ],
+        "buffers": [{"byteLength": offsets[-1]}],
+    }
+    header = json.dumps(document, separators=(",", ":")).encode("ascii")
+    header += b" " * (-len(header) % 4)
+    file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(header) + offsets[-1]))
+    file.write(struct.pack("<I4s", len(header), b"JSON") + header)
+    file.write(struct.pack("<I4s", offsets[-1], b"BIN\0"))
+    for array in arrays:
+        file.write(array.tobytes())
 
 
 def write_obj(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
     """Wavefront OBJ, z up, with normals; text, so large and slow."""
-    file.write(_trimesh(scan, params).export(file_type="obj", include_color=False).encode())
-
-
-def _trimesh(scan: Scan, params: ScanParams | None) -> Any:
     import trimesh
 
     surface, used = _compact(scan, params)
-    grey = _greys(scan)[used]
-    return trimesh.Trimesh(
-        vertices=surface.vertices,
-        faces=surface.triangles,
-        vertex_normals=_normals(scan, params)[used],
-        vertex_colors=np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1),
-        process=False,
-        metadata={str(key): str(value) for key, value in scan.comments.items()},
+    built = trimesh.Trimesh(
+        surface.vertices, surface.triangles, vertex_normals=_normals(scan, params)[used], process=False
     )
+    comment = "; ".join(comment_lines(scan)[: len(scan.comments)])
+    file.write(built.export(file_type="obj", header=f"scanmap mesh, metres; {comment}").encode())
+
+
+def _y_up(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3) from z up to glTF's y up; importers turn it back by the same rule."""
+    return np.ascontiguousarray(np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1))
 
 
 def _compact(scan: Scan, params: ScanParams | None) -> tuple[Mesh, NDArray[np.intp]]:
     """The mesh without points that no triangle uses, and which of the scan's points are left."""
     surface = mesh(scan, params)
+    if len(surface.triangles) == 0:
+        raise RecordingError(
+            f"no mesh: of {len(surface.vertices)} points no three are neighbours on one surface; write a cloud (.ply)"
+        )
     touched = np.zeros(len(surface.vertices), bool)
     touched[surface.triangles.ravel()] = True
     number = np.cumsum(touched, dtype=np.int32) - 1

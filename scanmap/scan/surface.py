@@ -22,37 +22,54 @@ Mask = NDArray[np.bool_]
 def remove_outliers(scan: Scan, params: ScanParams | None = None) -> Scan:
     """A copy without the points that no neighbour supports (`Reason.OUTLIER`).
 
-    A point stays if the row above or below lies on the same surface, or the next bearing does. Where the rows above
-    and below are there and the point hangs between them in depth it is a flying pixel at an edge, and the bearings
-    cannot save it.
+    A point stays if the row above or below lies on the same surface. If both rows are there and neither does, the
+    bearings decide: a wire along them stays, a speck does not, nor a flying pixel that hangs between two surfaces.
     """
-    params = params or ScanParams()
-    return scan.without(unsupported(scan, params), Reason.OUTLIER)
+    return scan.without(unsupported(scan, params or ScanParams()), Reason.OUTLIER)
 
 
 def unsupported(scan: Scan, params: ScanParams) -> Mask:
     """(B, H) cells with a point that no neighbour supports."""
-    halo = 2
+    halo, reach = 2, depth_edge_slope(params)
     d = disparity(scan, params, halo)
-    reach = depth_edge_slope(params)
     lonely = np.zeros((len(scan), scan.rows), bool)
     for block in blocks(len(scan), scan.rows):
-        wide = slice(block.start, block.stop + 2 * halo)
-        q = d.q[block.start + halo : block.stop + halo]
-        rows = row_links(d, slice(block.start + halo, block.stop + halo), reach)
-        alone = np.isfinite(q)
+        core = slice(block.start + halo, block.stop + halo)
+        rows = row_links(d, core, reach)
+        alone = np.isfinite(d.q[core])
         alone[:, 1:] &= ~rows
         alone[:, :-1] &= ~rows
-        if alone.any():
-            beside = bearing_links(d, wide, reach)
-            across = (beside[halo:-1] | beside[halo - 1 : -halo])[: len(q)]
-            with np.errstate(invalid="ignore"):
-                jump = np.diff(q, axis=1)
-                between = jump[:, 1:] * jump[:, :-1] > 0
-            across[:, 1:-1] &= ~between
-            alone &= ~across
         lonely[block] = alone
+    column, row = np.nonzero(lonely)
+    lonely[column, row] = ~_held_by_bearings(d, column + halo, row)
     return lonely
+
+
+def _held_by_bearings(d: Disparity, column: NDArray[np.intp], row: NDArray[np.intp]) -> Mask:
+    """Whether points that no row supports are supported by the bearings beside them; (N,) padded column and row."""
+    offsets = range(-2, 3)
+    q = {k: d.q[column + k, row] for k in offsets}
+    noise = {k: d.noise[column + k, row] for k in offsets}
+    step = {k: np.where(d.step[column + k] > 0, d.step[column + k], np.nan) for k in range(-2, 2)}
+    place = {-2: -step[-1] - step[-2], -1: -step[-1], 0: 0.0 * step[0], 1: step[0], 2: step[0] + step[1]}
+    if d.q.shape[1] < 2:
+        above = below = np.full(len(row), np.nan)
+    else:
+        above = np.where(row > 0, d.q[column, row - 1], np.nan)
+        below = np.where(row < d.q.shape[1] - 1, d.q[column, np.minimum(row + 1, d.q.shape[1] - 1)], np.nan)
+    with np.errstate(invalid="ignore"):
+        beside, straight = np.zeros(len(row), bool), np.zeros(len(row), bool)
+        for k in (-1, 1):
+            slack = noise[0] + noise[k] + d.turn[column, row] * np.abs(place[k])
+            beside |= np.abs(q[k] - q[0]) <= slack
+        for k in (-1, 0, 1):  # a wire: three neighbours in a line, this point one of them
+            before, after = place[k] - place[k - 1], place[k + 1] - place[k]
+            middle = (q[k - 1] * after + q[k + 1] * before) / (before + after)
+            bend = np.abs(q[0]) * before * after  # an even line in space is no straight line of disparities
+            straight |= np.abs(q[k] - middle) <= noise[k - 1] + noise[k] + noise[k + 1] + bend
+        between = (q[0] - above) * (below - q[0]) > 0
+    contradicted = np.isfinite(above) & np.isfinite(below)
+    return np.where(contradicted, straight & ~between, beside)
 
 
 def normals(scan: Scan, params: ScanParams | None = None) -> F32:
