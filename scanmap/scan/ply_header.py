@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ _NUMPY_TYPES = {
 # The names every reader knows, by numpy's type.
 PLY_TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 _ORDER = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Ten times the header of a scan of 20,000 bearings; what has none by then is no PLY.
+_LONGEST = 1 << 23
 
 
 class Header(NamedTuple):
@@ -37,11 +40,12 @@ def parse_header(data: bytes) -> Header:
     Raises:
         ValueError: not a PLY, or its vertices are not the first element or hold lists.
     """
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
+    # Only as a line of its own: a comment may hold the word too.
+    end = re.search(rb"\nend_header[ \t]*\r?\n", data[:_LONGEST])
+    if not data.startswith(b"ply") or end is None:
         raise ValueError("it does not begin with ply and a header")
     form, count, comments, fields, elements = "", 0, list[str](), list[tuple[str, str]](), list[str]()
-    for line in data[:end].decode("latin-1").splitlines()[1:]:
+    for line in data[: end.start()].decode("latin-1").splitlines()[1:]:
         word, _, rest = line.partition(" ")
         words = rest.split()
         if word == "comment":
@@ -59,7 +63,7 @@ def parse_header(data: bytes) -> Header:
         raise ValueError(f"its format is {form or 'missing'}; valid: {', '.join(_ORDER)}")
     if elements[:1] != ["vertex"]:
         raise ValueError(f"its first element is {elements[0] if elements else 'missing'}, not vertex")
-    return Header(form, comments, count, fields, data.find(b"\n", end) + 1)
+    return Header(form, comments, count, fields, end.end())
 
 
 def _count(line: str, words: list[str]) -> int:
