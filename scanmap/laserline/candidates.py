@@ -18,6 +18,7 @@ COUNT = 3  # candidates per block
 # at full, half and quarter resolution, for lines of sigma 0.7 to 8 px.
 _CENTRE, _AWAY = 5, 7
 _MARGIN = 48  # [px] what the filter needs beside the window at quarter resolution; divisible by 4
+_COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
 _COLOURLESS = 240  # [grey levels] from here on a sample has no colour
 _APART = 14  # [px] two candidates are at least this far apart: nearer ones are one line in two filters
 _CONNECTED_PX = 9.0  # a line does not run farther than this from block to block
@@ -114,15 +115,19 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     height = core / (5 * BLOCK) - side / (4 * BLOCK)
     own = np.maximum(height[..., channel], 1.0)
     other = np.delete(height, channel, axis=-1).max(axis=-1)
-    saturated = image[rows[:, None] + BLOCK // 2, middle, channel] >= 245
+    beside = np.clip(middle[..., None] + np.arange(-2, 3), 0, image.shape[1] - 1)
+    brightest = [image[rows[:, None, None] + row, beside, channel].max(axis=-1) for row in range(BLOCK)]
+    saturated = np.max(brightest, axis=0) >= _COLOURLESS
     strong = ~saturated & (candidates.snr > 20.0)
     if strong[:, 0].sum() < 8:
         return np.ones_like(candidates.snr)
     share, weight = (other / own)[strong], np.minimum(candidates.snr[strong], 100.0)
     order = np.argsort(share)
-    laser = float(share[order][np.searchsorted(np.cumsum(weight[order]), 0.3 * weight.sum())])
+    laser = float(share[order][np.searchsorted(np.cumsum(weight[order]), 0.1 * weight.sum())])
     # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
-    excess = other - (max(laser, 0.0) + 0.35) * own
+    if laser > _COLOURLESS_SHARE:
+        return np.ones_like(candidates.snr)
+    excess = other - (max(laser, 0.0) + 0.45) * own
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
     doubt = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.25 * own), 0.0, 1.0)
     return np.where(saturated, 1.0, doubt).astype(np.float32)

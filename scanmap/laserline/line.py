@@ -21,6 +21,8 @@ F32 = NDArray[np.float32]
 
 # What a core must stand out by where no profile could be fitted: in noise, and in grey levels.
 _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
+# A saturated line this wide whose core and flanks disagree by this much is taken for a core in a halo.
+_HALO_WIDTH_PX, _HALO_LEAN_PX = 2.5, 0.0
 
 
 class Reason(IntEnum):
@@ -170,6 +172,10 @@ def _located(
         offset = centre_of_gravity(y) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
         if params.method == "gauss":
+            # A wide saturated line whose flanks lean away from its core stands in a halo.
+            wide_core = np.flatnonzero(peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & (reason == Reason.OK))
+            lean = np.abs(bright_core(y[wide_core]).offset_px - peaks.offset_px[wide_core])
+            reason[wide_core[lean > _HALO_LEAN_PX]] = Reason.WIDE
             _take_cores(line, r, c, y, reason, noise)
         # An edge that cuts the line shows as an odd residual; what it may have moved the column by is added.
         bias = 0.5 * peaks.width_px * np.maximum(np.abs(peaks.asymmetry) - 0.05, 0.0)
@@ -256,6 +262,7 @@ def _without_blobs(line: LaserLine) -> LaserLine:
     sharp = np.percentile(across[strong], 40)
     with np.errstate(invalid="ignore"):
         blob = (across > 2.2 * sharp + 0.5) & (line.peak < 140.0)
+        blob |= (across > 1.5 * sharp + 0.3) & (line.peak < 0.25 * np.median(line.peak[strong]))
     return _lost(line, blob, Reason.WIDE)
 
 

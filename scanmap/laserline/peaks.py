@@ -14,6 +14,7 @@ SIGMA_MIN_PX, SIGMA_MAX_PX = 0.3, 14.0
 _REACH = 3.2  # [sigma] samples farther from the line say nothing of it
 _ITERATIONS = 2
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
+_CORE_SHARE = 0.35  # of the height that a core is taken from
 _SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
 
 
@@ -97,26 +98,26 @@ def bright_core(y: F32) -> Cores:
     """Middle of the core of each row (N, n), whatever surrounds it.
 
     For lines of one or two pixels that a camera has sharpened, and for saturated lines in the halo of wax, skin or
-    paint: there the core says where the light fell, the rest where it went. Centre of gravity of what rises above the
-    brighter side and the upper third of the height, within 4 px.
+    paint: there the core says where the light fell, the rest where it went. Centre of gravity of the run around the
+    peak that rises above the brighter side 6 to 8 px away and above most of the height.
     """
     half = y.shape[1] // 2
-    x = np.arange(-4, 5, dtype=np.float32)
-    near = y[:, half - 4 : half + 5]
+    rows = np.arange(len(y))
+    x = np.arange(y.shape[1], dtype=np.float32) - half
+    top = y[:, half - 4 : half + 5].max(axis=1)
+    peak = half - 4 + y[:, half - 4 : half + 5].argmax(axis=1)
     left, right = y[:, half - 8 : half - 5].mean(axis=1), y[:, half + 6 : half + 9].mean(axis=1)
-    top = near.max(axis=1)
     side = np.maximum(left, right)
-    level = np.maximum(side, top - 0.65 * (top - np.minimum(left, right)))
-    w = np.maximum(near - level[:, None], 0.0)
+    level = np.maximum(np.minimum(side, top - 4.0), top - _CORE_SHARE * (top - np.minimum(left, right)))
+    w = np.maximum(y - level[:, None], 0.0)
+    # Only the run that holds the peak: cut at the first sample below the level on either side.
+    gap = np.cumsum(w == 0.0, axis=1)
+    w *= gap == gap[rows, peak][:, None]
     total = np.maximum(w.sum(axis=1), 1e-3)
     offset = w @ x / total
     width = np.sqrt(np.maximum(w @ (x * x) / total - offset**2, 0.0) + 1.0 / 12.0)
-    return Cores(
-        offset.astype(np.float32),
-        np.maximum(0.12, 0.3 * width).astype(np.float32),
-        width.astype(np.float32),
-        top - side,
-    )
+    sigma = np.maximum(0.12, 0.3 * width)
+    return Cores(offset.astype(np.float32), sigma.astype(np.float32), width.astype(np.float32), top - side)
 
 
 def centre_of_gravity(y: F32, height_share: float = 0.2) -> F32:
