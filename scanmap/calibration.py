@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from scanmap.errors import CalibrationError
-from scanmap.geometry import HeadMount, inverse, is_rotation, rigid, rotation_z
+from scanmap.geometry import HeadMount, is_rotation, rigid, rotation_z
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,10 @@ class Intrinsics:
         return any(self.distortion)
 
     def rays(self, column: Array, row: Array) -> Array:
-        """Directions (..., 3) with z = 1 in the camera frame of pixels `column`, `row` (...,); NaN passes."""
+        """Directions (..., 3) with z = 1 in the camera frame of pixels `column`, `row` (...,); NaN passes.
+
+        NaN too where no ray comes out at the pixel: a polynomial that folds over inside the image.
+        """
         if not self.distorted:
             x = (column - self.cx) / self.fx
             y = (row - self.cy) / self.fy
@@ -55,10 +58,13 @@ class Intrinsics:
         xy = np.full((known.size, 2), np.nan)
         if known.any():
             pixels = np.stack([column.ravel()[known], row.ravel()[known]], axis=-1)
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-            xy[known] = cv2.undistortPoints(
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+            found = cv2.undistortPoints(
                 pixels[:, None], self.matrix, np.array(self.distortion), None, None, None, criteria
             )[:, 0]
+            back = self.project(np.concatenate([found, np.ones((len(found), 1))], axis=1))
+            found[~(np.abs(back - pixels).max(axis=1) < 1e-3)] = np.nan
+            xy[known] = found
         return np.concatenate([xy, np.ones((known.size, 1))], axis=1).reshape(*shape, 3)
 
     def project(self, points_cam: Array) -> Array:
@@ -132,7 +138,11 @@ class Calibration:
             cx=(old.cx + 0.5) * sx - 0.5, cy=(old.cy + 0.5) * sy - 0.5,
         )  # fmt: skip
         ratio = replace(self.ratio, width=width) if self.ratio else None
-        angle = replace(self.pixel_angle, rpc_deg=self.pixel_angle.rpc_deg / sx) if self.pixel_angle else None
+        angle = self.pixel_angle
+        if angle is not None:
+            # Column u of the old image is (u + 0.5) sx - 0.5 of the new one.
+            half = 0.5 * angle.rpc_deg * (1.0 / sx - 1.0)
+            angle = replace(angle, rpc_deg=angle.rpc_deg / sx, ro_deg=angle.ro_deg + half)
         return replace(self, intrinsics=intrinsics, ratio=ratio, pixel_angle=angle)
 
     def check_image(self, width: int, height: int) -> None:
@@ -162,14 +172,12 @@ class Calibration:
     def loads(cls, text: str, source: str = "calibration") -> Calibration:
         """Parse the TOML text of a calibration; `source` names it in errors."""
         try:
-            return CalibrationFile.model_validate(tomllib.loads(text)).build()
+            # Strictly, so that text is never taken for a number; a TOML array is a tuple here.
+            return CalibrationFile.model_validate(_with_tuples(tomllib.loads(text)), strict=True).build()
         except tomllib.TOMLDecodeError as error:
             raise CalibrationError(f"{source} is not valid TOML: {error}") from error
         except ValidationError as error:
-            faults = "; ".join(
-                f"{'.'.join(str(p) for p in fault['loc']) or 'file'}: {fault['msg']}" for fault in error.errors()
-            )
-            raise CalibrationError(f"{source}: {faults}") from error
+            raise CalibrationError(f"{source}: {'; '.join(_faults(error))}") from error
 
     def dumps(self) -> str:
         """The calibration as TOML text; `loads` gives it back bit for bit."""
@@ -203,7 +211,7 @@ class Calibration:
         for name in ("residuals", "covariance", "meta"):
             if getattr(self, name):
                 document[name] = getattr(self, name)
-        return tomli_w.dumps(document)
+        return tomli_w.dumps(_plain(document))
 
     def save(self, path: Path | str) -> None:
         """Write the calibration as TOML."""
@@ -211,6 +219,44 @@ class Calibration:
             Path(path).write_text(self.dumps(), encoding="utf-8")
         except OSError as error:
             raise CalibrationError(f"calibration {path} cannot be written: {error}") from error
+
+
+def _with_tuples(document: dict[str, Any]) -> dict[str, Any]:
+    """The tables with fixed keys with their arrays as tuples; what the solvers wrote stays as it is."""
+
+    def tupled(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: tupled(below) for key, below in value.items()}
+        return tuple(tupled(below) for below in value) if isinstance(value, list) else value
+
+    free = ("residuals", "covariance", "meta")
+    return {name: value if name in free else tupled(value) for name, value in document.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numpy's numbers, which the solvers compute with, as what TOML knows."""
+    if isinstance(value, dict):
+        return {str(key): _plain(below) for key, below in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(below) for below in value]
+    return _plain(value.tolist()) if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _faults(error: ValidationError) -> list[str]:
+    """Every fault in words: path, the bad value, what is allowed."""
+    faults = []
+    for detail in error.errors():
+        where = ".".join(str(part) for part in detail["loc"]) or "file"
+        message = detail["msg"].removeprefix("Value error, ")
+        if detail["type"] == "extra_forbidden":
+            table: Any = CalibrationFile
+            for part in detail["loc"][:-1]:
+                table = _TABLES[str(part)]
+            message = f"no key of a calibration; valid: {', '.join(table.model_fields)}"
+        elif isinstance(detail["input"], int | float | str):
+            where = f"{where} = {detail['input']!r}"
+        faults.append(f"{where}: {message}")
+    return faults
 
 
 class ImageTable(BaseModel, frozen=True, extra="forbid"):
@@ -223,32 +269,62 @@ class ImageTable(BaseModel, frozen=True, extra="forbid"):
 class IntrinsicsTable(BaseModel, frozen=True, extra="forbid"):
     """`[intrinsics]`: pinhole and distortion, OpenCV's convention."""
 
-    fx: float = Field(gt=0, description="focal length in columns [px]")
-    fy: float = Field(gt=0, description="focal length in rows [px]")
-    cx: float = Field(description="principal point, column [px]")
-    cy: float = Field(description="principal point, row [px]")
-    distortion: tuple[float, ...] = Field((0.0,) * 5, max_length=5, description="k1 k2 p1 p2 k3")
+    fx: FiniteFloat = Field(gt=0, description="focal length in columns [px]")
+    fy: FiniteFloat = Field(gt=0, description="focal length in rows [px]")
+    cx: FiniteFloat = Field(description="principal point, column [px]")
+    cy: FiniteFloat = Field(description="principal point, row [px]")
+    distortion: tuple[FiniteFloat, ...] = Field((0.0,) * 5, max_length=5, description="k1 k2 p1 p2 k3")
 
 
 class HeadTable(BaseModel, frozen=True, extra="forbid"):
     """`[head]`: where the camera and the laser plane are; either the full form or the short one."""
 
-    T_head_camera: tuple[tuple[float, float, float, float], ...] | None = Field(
+    T_head_camera: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, min_length=4, max_length=4, description="camera frame to head frame, 4x4"
     )
-    laser_plane: tuple[float, float, float, float] = Field(
+    laser_plane: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = Field(
         (0.0, 1.0, 0.0, 0.0), description="n.x + d = 0 in the head frame [m]"
     )
-    baseline_m: float | None = Field(None, gt=0, description="short form: camera left of the laser by [m]")
-    beta_deg: float | None = Field(None, gt=-80, lt=80, description="short form: inward yaw [deg]")
-    alpha_deg: float | None = Field(None, gt=1, lt=85, description="short form: half horizontal view [deg]")
+    baseline_m: FiniteFloat | None = Field(None, gt=0, description="short form: camera left of the laser by [m]")
+    beta_deg: FiniteFloat | None = Field(None, gt=-80, lt=80, description="short form: inward yaw [deg]")
+    alpha_deg: FiniteFloat | None = Field(None, gt=1, lt=85, description="short form: half horizontal view [deg]")
+
+    @field_validator("T_head_camera")
+    @classmethod
+    def _rigid(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        if value is not None:
+            T = np.array(value)
+            if not is_rotation(T[:3, :3]) or not np.allclose(T[3], [0, 0, 0, 1]):
+                raise ValueError("is not a rigid transform (a rotation, a shift, last row 0 0 0 1)")
+        return value
+
+    @field_validator("laser_plane")
+    @classmethod
+    def _has_normal(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if np.linalg.norm(value[:3]) < 1e-9:
+            raise ValueError("has no normal: its first three numbers are zero")
+        return value
+
+    @model_validator(mode="after")
+    def _one_form(self) -> HeadTable:
+        short = {"baseline_m": self.baseline_m, "beta_deg": self.beta_deg}
+        missing = [name for name, value in short.items() if value is None]
+        if self.T_head_camera is None and missing:
+            raise ValueError(f"needs T_head_camera, or baseline_m and beta_deg; {' and '.join(missing)} missing")
+        if self.T_head_camera is not None and len(missing) < len(short):
+            raise ValueError("has both T_head_camera and the short form (baseline_m, beta_deg); keep one")
+        return self
 
 
 class AxisTable(BaseModel, frozen=True, extra="forbid"):
     """`[axis]`: how the head sits on the axis."""
 
-    head_offset_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="head origin from the axis [m]")
-    tilt_deg: tuple[float, float] = Field((0.0, 0.0), description="axis against head z, about x and y [deg]")
+    head_offset_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        (0.0, 0.0, 0.0), description="head origin from the axis [m]"
+    )
+    tilt_deg: tuple[FiniteFloat, FiniteFloat] = Field(
+        (0.0, 0.0), description="axis against head z, about x and y [deg]"
+    )
 
 
 class RatioTable(BaseModel, frozen=True, extra="forbid"):
@@ -256,16 +332,16 @@ class RatioTable(BaseModel, frozen=True, extra="forbid"):
 
     alpha_deg: float = Field(gt=0, lt=85, description="half horizontal view [deg]")
     beta_deg: float = Field(gt=-80, lt=80, description="inward yaw [deg]")
-    baseline_m: float = Field(gt=0, description="camera to laser [m]")
+    baseline_m: FiniteFloat = Field(gt=0, description="camera to laser [m]")
     width: int | None = Field(None, gt=0, description="image width l [px]; the [image] width if left out")
 
 
 class PixelAngleTable(BaseModel, frozen=True, extra="forbid"):
     """`[pixel_angle]`: Algorithm 2 of the thesis."""
 
-    rpc_deg: float = Field(description="angle per column [deg/px]")
-    ro_deg: float = Field(description="angle at column 0 [deg]")
-    baseline_m: float = Field(gt=0, description="camera to laser [m]")
+    rpc_deg: FiniteFloat = Field(gt=0, description="angle per column [deg/px]")
+    ro_deg: FiniteFloat = Field(description="angle at column 0 [deg]")
+    baseline_m: FiniteFloat = Field(gt=0, description="camera to laser [m]")
 
 
 class CalibrationFile(BaseModel, frozen=True, extra="forbid"):
@@ -287,24 +363,10 @@ class CalibrationFile(BaseModel, frozen=True, extra="forbid"):
 
     @model_validator(mode="after")
     def _complete(self) -> CalibrationFile:
-        head = self.head
-        if head.T_head_camera is None and (head.baseline_m is None or head.beta_deg is None):
-            raise ValueError("[head] needs T_head_camera, or baseline_m and beta_deg")
-        if head.T_head_camera is not None and (head.baseline_m is not None or head.beta_deg is not None):
-            raise ValueError("[head] has both T_head_camera and the short form; keep one")
-        if self.intrinsics is None and head.alpha_deg is None:
+        if self.intrinsics is None and self.head.alpha_deg is None:
             raise ValueError("needs [intrinsics], or alpha_deg in [head]")
-        if self.intrinsics is not None and head.alpha_deg is not None:
-            raise ValueError("has both [intrinsics] and alpha_deg; keep one")
-        if head.T_head_camera is not None:
-            T = np.array(head.T_head_camera)
-            if not is_rotation(T[:3, :3]) or not np.allclose(T[3], [0, 0, 0, 1]):
-                raise ValueError("head.T_head_camera is not a rigid transform (rotation, last row 0 0 0 1)")
-        if np.linalg.norm(head.laser_plane[:3]) < 1e-9:
-            raise ValueError("head.laser_plane has no normal: its first three numbers are zero")
-        numbers = np.concatenate([np.ravel(head.T_head_camera or [0.0]), head.laser_plane, self.axis.head_offset_m])
-        if not np.isfinite(numbers).all():
-            raise ValueError("[head] or [axis] holds a number that is not finite")
+        if self.intrinsics is not None and self.head.alpha_deg is not None:
+            raise ValueError("has both [intrinsics] and head.alpha_deg; keep one")
         return self
 
     def build(self) -> Calibration:
@@ -346,6 +408,8 @@ class CalibrationFile(BaseModel, frozen=True, extra="forbid"):
         return RatioModel(self.ratio.alpha_deg, self.ratio.beta_deg, self.ratio.baseline_m, width)
 
 
-def T_camera_head(calibration: Calibration) -> Array:
-    """(4, 4) head frame to camera frame."""
-    return inverse(calibration.T_head_camera)
+# The tables by the names they have in the file.
+_TABLES: dict[str, type[BaseModel]] = {
+    "image": ImageTable, "intrinsics": IntrinsicsTable, "head": HeadTable, "axis": AxisTable, "ratio": RatioTable,
+    "pixel_angle": PixelAngleTable,
+}  # fmt: skip

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 # Algorithm 2 is valid below this angle only; the thesis's limit.
 THETA_MAX_DEG = 60.0
+# Sampling of an image row in search of the columns a return can have.
+WINDOW_STEP_PX = 8.0
 
 
 class TriangulationParams(BaseModel, frozen=True, extra="forbid"):
@@ -166,40 +168,64 @@ def column_window(calibration: Calibration, params: TriangulationParams) -> Arra
     NaN in rows that can have none. Nothing outside is ever the laser line: geometry is a filter.
     """
     own = calibration.intrinsics
-    step = 8.0
-    column = np.append(np.arange(0.0, own.width - 1, step), own.width - 1.0)
     row = np.arange(own.height, dtype=np.float64)
-    u, v = (a.ravel() for a in np.meshgrid(column, row))
-    points, _, below = locate(u, v, calibration, params)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(below, np.inf, 1.0 / np.linalg.norm(points, axis=-1)).reshape(own.height, -1)
-        largest = 1.0 / params.range_min_m if params.range_min_m > 0 else np.inf
-    inside = (inverse >= 1.0 / params.range_max_m) & (inverse <= largest)
-    return _refine_window(inverse, inside, column, 1.0 / params.range_max_m, largest)
+    coarse = np.append(np.arange(0.0, own.width - 1, WINDOW_STEP_PX), own.width - 1.0)
+    column = np.tile(coarse, (own.height, 1))
+    place = _against_limits(column, row, calibration, params)
+    window = _hull(column, place, row, calibration, params)
+    # Limits so close together that they fall between two samples: from too near to too far in one step.
+    skips = np.diff(place, axis=1)
+    narrow = (np.abs(skips) == 2) & np.isnan(window[:, :1])
+    some = np.flatnonzero(narrow.any(axis=1))
+    if some.size:
+        k = narrow[some].argmax(axis=1)
+        fine = coarse[k, None] + (coarse[k + 1] - coarse[k])[:, None] * np.linspace(0.0, 1.0, 65)
+        place = _against_limits(fine, row[some], calibration, params)
+        window[some] = _hull(fine, place, row[some], calibration, params)
+    return window
 
 
-def _refine_window(inverse: Array, inside: NDArray[np.bool_], column: Array, low: float, high: float) -> Array:
-    """Columns where the inverse range enters and leaves [low, high]: it is all but linear in the column."""
-    rows, last = np.arange(len(inverse)), len(column) - 1
-    window = np.full((len(inverse), 2), np.nan)
-    some = inside.any(axis=1)
-    edges = (inside.argmax(axis=1), last - inside[:, ::-1].argmax(axis=1))
+def _against_limits(
+    column: Array, row: Array, calibration: Calibration, params: TriangulationParams
+) -> NDArray[np.int8]:
+    """Whether pixels (N, M) of rows (N,) lie too near (-1), between the limits (0), or too far (1)."""
+    points, _, below = locate(column.ravel(), np.repeat(row, column.shape[1]), calibration, params)
+    range_m = np.linalg.norm(points, axis=-1)
+    near = below | (range_m < params.range_min_m)
+    place = np.where(near, -1, np.where(range_m <= params.range_max_m, 0, 1))
+    return place.astype(np.int8).reshape(column.shape)
+
+
+def _hull(
+    column: Array, place: NDArray[np.int8], row: Array, calibration: Calibration, params: TriangulationParams
+) -> Array:
+    """First and last column (N, 2) between the limits, by bisection between the samples `column` (N, M)."""
+    inside = place == 0
+    window = np.full((len(row), 2), np.nan)
+    some = np.flatnonzero(inside.any(axis=1))
+    last = column.shape[1] - 1
+    edges = (inside[some].argmax(axis=1), last - inside[some, ::-1].argmax(axis=1))
     for side, (edge, outward) in enumerate(zip(edges, (-1, 1), strict=True)):
-        beyond = np.clip(edge + outward, 0, last)
-        a, b = inverse[rows, edge], inverse[rows, beyond]
-        limit = np.where(np.nan_to_num(b, nan=0.0) < a, low, high)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            part = np.clip((limit - a) / (np.where(np.isfinite(b), b, np.nan) - a), 0.0, 1.0)
-        # Where the neighbour has no range (infinity, below range) take its column: wide, never narrow.
-        part = np.where(np.isfinite(part), part, 1.0)
-        window[some, side] = (column[edge] + part * (column[beyond] - column[edge]))[some]
+        good, bad = column[some, edge], column[some, np.clip(edge + outward, 0, last)]
+        for _ in range(12):
+            middle = 0.5 * (good + bad)
+            fits = _against_limits(middle[:, None], row[some], calibration, params)[:, 0] == 0
+            good, bad = np.where(fits, middle, good), np.where(fits, bad, middle)
+        window[some, side] = good
     return window
 
 
 def _baseline(calibration: Calibration) -> float:
-    baseline = calibration.baseline_m
+    """Baseline [m] of a head the thesis's two models hold for."""
+    baseline, plane = calibration.baseline_m, calibration.laser_plane
     if baseline < 1e-6:
         raise CalibrationError("this head has no baseline: its camera lies in the laser plane")
+    side = plane[:3] @ calibration.T_head_camera[:3, 3] + plane[3]
+    if side * (plane[:3] @ calibration.T_head_camera[:3, 0]) >= 0:
+        raise CalibrationError(
+            "models ratio and pixel_angle want near returns on the right of the image (camera left of the laser); "
+            "this head has them on the left; use model plane"
+        )
     return baseline
 
 
