@@ -87,7 +87,7 @@ def find_candidates(plane: U8, window: NDArray[np.float64], noise: float, other:
         if k + 1 < COUNT:
             response[rows[:, None], np.clip(best[:, None] + around, 0, response.shape[1] - 1)] = 0
     # A mean of 5 columns of 4 rows, minus the larger of two such: 1.35 / sqrt(5) of the sum's noise.
-    snr /= np.float32(noise * 1.35 * np.sqrt(BLOCK / _CENTRE))
+    snr /= np.float32(max(noise, 1.2) * 1.35 * np.sqrt(BLOCK / _CENTRE))
     return Candidates(column, snr)
 
 

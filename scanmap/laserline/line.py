@@ -19,10 +19,12 @@ Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
+# A run is not the laser line from this share of its height in another channel on.
+_STRANGER = 0.62
 # What a core must stand out by where no profile could be fitted: in noise, and in grey levels.
 _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
-# A saturated line this wide whose core and flanks disagree by this much is taken for a core in a halo.
-_HALO_WIDTH_PX, _HALO_LEAN_PX = 2.5, 0.0
+# A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
+_HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 
 
 class Reason(IntEnum):
@@ -143,6 +145,8 @@ def find_laser_line(
     line = _located(plane, lit, (row, column), noise, params)
     line = _within(line, window)
     line = _without_blobs(line)
+    if channel is not None and background is None:
+        line = _without_strangers(line, image, channel)
     line = _without_crumbs(line)
     if params.pool_rows >= 3:
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
@@ -172,10 +176,9 @@ def _located(
         offset = centre_of_gravity(y) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
         if params.method == "gauss":
-            # A wide saturated line whose flanks lean away from its core stands in a halo.
-            wide_core = np.flatnonzero(peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & (reason == Reason.OK))
-            lean = np.abs(bright_core(y[wide_core]).offset_px - peaks.offset_px[wide_core])
-            reason[wide_core[lean > _HALO_LEAN_PX]] = Reason.WIDE
+            # A wide saturated line whose flanks are no Gaussian's stands in a halo.
+            misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
+            reason[peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & (reason == Reason.OK)] = Reason.WIDE
             _take_cores(line, r, c, y, reason, noise)
         # An edge that cuts the line shows as an odd residual; what it may have moved the column by is added.
         bias = 0.5 * peaks.width_px * np.maximum(np.abs(peaks.asymmetry) - 0.05, 0.0)
@@ -264,6 +267,29 @@ def _without_blobs(line: LaserLine) -> LaserLine:
         blob = (across > 2.2 * sharp + 0.5) & (line.peak < 140.0)
         blob |= (across > 1.5 * sharp + 0.3) & (line.peak < 0.25 * np.median(line.peak[strong]))
     return _lost(line, blob, Reason.WIDE)
+
+
+def _without_strangers(line: LaserLine, image: U8, channel: int) -> LaserLine:
+    """Give up runs of rows that stand out in another channel nearly as much as in the laser's own.
+
+    Over a whole run the shares of the channels are known far better than in a row. Runs whose core saturates are left
+    alone, and so is all of a picture without colour.
+    """
+    row = np.flatnonzero(np.isfinite(line.column_px))
+    if not row.size or np.abs(np.diff(image[::16, ::16].astype(np.int16), axis=2)).mean() < 1.0:
+        return line
+    run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(line.column_px[row])) > 3.0))])
+    middle = np.rint(line.column_px[row]).astype(np.intp)
+    x = np.clip(middle[:, None] + np.array([-2, -1, 0, 1, 2, -9, -8, 8, 9]), 0, image.shape[1] - 1)
+    samples = image[row[:, None], x].astype(np.float32)
+    height = samples[:, :5].mean(axis=1) - samples[:, 5:].mean(axis=1)
+    by_run = np.stack([np.bincount(run, height[:, c]) for c in range(3)], axis=-1)
+    clipped = np.bincount(run, (samples[:, :5, channel].max(axis=1) >= SATURATED - 10).astype(np.float64))
+    other = np.delete(by_run, channel, axis=1).max(axis=1)
+    stranger = (other > _STRANGER * by_run[:, channel]) & (clipped < 0.3 * np.bincount(run))
+    lost = np.zeros(len(line.column_px), bool)
+    lost[row[stranger[run]]] = True
+    return _lost(line, lost, Reason.AMBIGUOUS)
 
 
 def _without_crumbs(line: LaserLine) -> LaserLine:
