@@ -26,7 +26,7 @@ laser_plane = [0.0, 1.0, 0.0, 0.0]       # n.x + d = 0 in the head frame, metres
 [axis]
 head_offset_m = [0.0, 0.0, 0.0]          # head origin seen from the axis
 tilt_deg = [0.0, 0.0]                    # axis against the head's z, about x and y
-"""
+"""  # noqa: E501
 SHORT = """
 [image]
 width = 1600
@@ -208,10 +208,10 @@ def test_missing_parts_of_the_short_form_are_named():
 
 
 def test_an_unreadable_file_is_one_clear_error(tmp_path):
-    with pytest.raises(CalibrationError, match="absent.toml cannot be read"):
+    with pytest.raises(CalibrationError, match=r"absent\.toml cannot be read"):
         Calibration.load(tmp_path / "absent.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(CalibrationError, match="binary.toml cannot be read"):
+    with pytest.raises(CalibrationError, match=r"binary\.toml cannot be read"):
         Calibration.load(tmp_path / "binary.toml")
     with pytest.raises(CalibrationError, match="cannot be written"):
         Calibration.loads(EXAMPLE).save(tmp_path / "no" / "folder.toml")
