@@ -62,11 +62,13 @@ def _held_by_bearings(d: Disparity, column: NDArray[np.intp], row: NDArray[np.in
         for k in (-1, 1):
             slack = noise[0] + noise[k] + d.turn[column, row] * np.abs(place[k])
             beside |= np.abs(q[k] - q[0]) <= slack
-        for k in (-1, 0, 1):  # a wire: three neighbours in a line, this point one of them
+        for k in (-1, 0, 1):  # a wire: three neighbours in a line, not too steep, this point one of them
             before, after = place[k] - place[k - 1], place[k + 1] - place[k]
             middle = (q[k - 1] * after + q[k + 1] * before) / (before + after)
             bend = np.abs(q[0]) * before * after  # an even line in space is no straight line of disparities
-            straight |= np.abs(q[k] - middle) <= noise[k - 1] + noise[k] + noise[k + 1] + bend
+            slack = noise[k - 1] + noise[k] + noise[k + 1]
+            gentle = np.abs(q[k + 1] - q[k - 1]) <= slack + 2.0 * d.turn[column, row] * (before + after)
+            straight |= gentle & (np.abs(q[k] - middle) <= slack + bend)
         between = (q[0] - above) * (below - q[0]) > 0
     contradicted = np.isfinite(above) & np.isfinite(below)
     return np.where(contradicted, straight & ~between, beside)
