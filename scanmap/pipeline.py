@@ -20,7 +20,6 @@ from scanmap.laserline import LaserLine, LaserLineParams, Reason, find_laser_lin
 from scanmap.shot import Decoded, Shot, decode_image
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
 
-
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
 
 

@@ -112,7 +112,7 @@ def _rows_of_damaged_jpeg(data: bytes, pixels: Image, warning: str) -> int:
     stray = re.search(r"(\d+) extraneous bytes", warning)
     if stray is None or int(stray[1]) > HARMLESS_BYTES:
         raise CameraError(f"JPEG of {len(data)} bytes is damaged inside: {warning}")
-    return pixels.shape[0]
+    return len(pixels)
 
 
 def _is_whole_png(data: bytes) -> bool:

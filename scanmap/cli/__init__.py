@@ -5,14 +5,14 @@ Nothing heavy is imported here: `scanmap --help` must answer at once, so every c
 
 from __future__ import annotations
 
-import logging
+import errno
 import sys
 from typing import Annotated
 
 import typer
 
 from scanmap import __version__
-from scanmap.cli import look, scanning, settings
+from scanmap.cli import look, scanning, settings, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -55,22 +55,40 @@ def main(argv: list[str] | None = None) -> None:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
-    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    terminal.set_up_logging(debug)
+    code = _run([word for word in words if word != "--debug"] or ["--help"], debug)
+    terminal.output.flush()
+    if terminal.output.error is not None:
+        terminal.complain(f"the output could not be printed: {terminal.output.error.strerror}")
+        code = code or 1
+    sys.exit(code)
+
+
+def _run(words: list[str], debug: bool) -> int:
+    """The exit code of a command; every error said in one line, or raised when debugging."""
     try:
-        app([word for word in words if word != "--debug"], prog_name="scanmap")
-    except ScanmapError as error:
-        if debug:
-            raise
-        print(f"scanmap: {error}", file=sys.stderr)
-        sys.exit(2 if isinstance(error, ConfigError) else 1)
+        return int(app(words, prog_name="scanmap", standalone_mode=False) or 0)
     except KeyboardInterrupt:
-        print("scanmap: interrupted", file=sys.stderr)
-        sys.exit(130)
+        terminal.complain("interrupted")
+        return 130
     except Exception as error:
-        if debug:
+        if isinstance(error, OSError) and error.errno == errno.EPIPE:
+            return 0
+        usage = _usage(error)
+        if debug and not usage:
             raise
-        print(
-            f"scanmap: {type(error).__name__}: {error}. This is a bug; the same command with --debug shows where",
-            file=sys.stderr,
-        )
-        sys.exit(1)
+        bug = f"{type(error).__name__}: {error}. This is a bug; the same command with --debug shows where"
+        terminal.complain(usage or (str(error) if isinstance(error, ScanmapError) else bug))
+        return 2 if usage or isinstance(error, ConfigError) else 1
+
+
+def _usage(error: Exception) -> str:
+    """What is wrong with the command line itself, and what would be right; empty for any other error."""
+    say_it = getattr(error, "format_message", None)
+    if say_it is None:
+        return ""
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "scanmap"
+    valid = ", ".join(getattr(context.command, "commands", ())) if context is not None else ""
+    commands = f"; commands: {valid}" if valid else ""
+    return f"{str(say_it()).rstrip('.')}{commands}; try {command} --help"

@@ -9,12 +9,17 @@ import typer
 
 from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
 
-Source = Annotated[Path, typer.Argument(help="A recording (.mcap), a folder with scan.csv, or a cloud (.ply).")]
+Source = Annotated[
+    Path, typer.Argument(metavar="SOURCE", help="A recording (.mcap), a folder with scan.csv, or a cloud (.ply).")
+]
 
 
 def view(
     source: Annotated[
-        Path | None, typer.Argument(help="A recording (.mcap), a folder with scan.csv, or a .rrd.")
+        Path | None,
+        typer.Argument(
+            metavar="[SOURCE]", help="A recording (.mcap), a folder with scan.csv, a video, .rrd, cloud or mesh."
+        ),
     ] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
@@ -27,11 +32,16 @@ def view(
 ) -> None:
     """Open the rerun viewer on 127.0.0.1 with scanmap's layout.
 
-    Examples: scanmap view room.mcap;  scanmap view room.mcap --save room.rrd;  scanmap view --live 9876
+    Examples: scanmap view room.mcap
+
+    scanmap view room.mcap --save room.rrd
+
+    scanmap view --live 9876
     """
     from scanmap import session
-    from scanmap.cli.report import progress_bar, say, stop_on_signal
-    from scanmap.errors import ConfigError
+    from scanmap.cli.report import progress_bar
+    from scanmap.cli.terminal import say, stop_on_signal
+    from scanmap.errors import ConfigError, RecordingError
 
     if live is not None:
         if source is not None or save is not None:
@@ -40,23 +50,28 @@ def view(
         return
     if source is None:
         raise ConfigError("nothing to view: give SOURCE, or --live PORT of a running scan")
-    if source.suffix == ".rrd":
+    if session.shown_as_it_is(source):
         if save is not None:
-            raise ConfigError(f"{source} is a .rrd already; --save wants a recording or a folder")
+            raise ConfigError(f"--save makes an .rrd of a recording, a folder or a video; {source} is none")
         session.show(source)
         return
-    with session.prepare_view(source, session.Choice(config, tuple(set_ or ()), calibration), save) as job:
-        with stop_on_signal() as stop, progress_bar() as progress:
-            result = job.run(progress, stop)
+    choice = session.Choice(config, tuple(set_ or ()), calibration)
+    with stop_on_signal() as stop, session.prepare_view(source, choice, save) as job:
+        with progress_bar("reading", job.total) as progress:
+            result = job.run(progress, stop.orderly("stopping: what was read so far is shown"))
         for fault in result.faults:
             say(f"fault: {fault}")
         if save is None and result.files:
-            session.show(result.files[0])
-        else:
-            for path in result.files:
-                say(f"wrote {path}")
+            say("the viewer is open; this command ends with it")
+            session.show(result.files[0]).wait()
+        for path in result.files if save is not None else ():
+            say(f"wrote {path}")
     if result.error is not None:
         raise result.error
+    for path, error in result.unwritten:
+        raise RecordingError(f"{path} could not be written: {error}")
+    if result.ended == "interrupted":
+        raise typer.Exit(130)
 
 
 def make_map(
@@ -85,20 +100,42 @@ def make_map(
     Example: scanmap map room.mcap --out room.yaml --resolution-m 0.05 --height-m 0.1:1.8
     """
     from scanmap import session
-    from scanmap.cli.report import progress_bar, say, stop_on_signal
+    from scanmap.cli.report import progress_bar
+    from scanmap.cli.terminal import say, stop_on_signal
 
     settings = (*(set_ or ()), *session.map_settings(resolution_m, height_m))
     outputs = session.Outputs(map=out, map_image=image, map_mode=mode)
-    with stop_on_signal() as stop, progress_bar() as progress:
-        made = session.make_map(source, session.Choice(config, settings, calibration), outputs, progress, stop)
-    for line in made:
+    choice = session.Choice(config, settings, calibration)
+    if source.suffix.lower() == ".ply":
+        for line in session.map_of_cloud(source, choice, outputs):
+            say(line)
+        return
+    with (
+        stop_on_signal() as stop,
+        session.prepare_replay(source, choice, outputs) as job,
+        progress_bar("reading", job.total) as progress,
+    ):
+        result = job.run(progress, stop.orderly("stopping: the map is made of what was read so far"))
+    for line in session.map_lines(result):
         say(line)
+    if result.error is not None:
+        raise result.error
+    if result.ended == "interrupted":
+        raise typer.Exit(130)
 
 
-def info(file: Annotated[Path, typer.Argument(help="A recording, cloud, map (.yaml) or calibration (.toml).")]) -> None:
-    """Say what a recording, cloud or map holds: plan, rig, versions, counts, how it ended."""
+def info(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="Recording, folder, cloud, mesh, map (.yaml), calibration or rig (.toml)."),
+    ],
+) -> None:
+    """Say what a recording, cloud or map holds.
+
+    Of a recording: plan, rig, versions, counts, how it ended.
+    """
     from scanmap import session
-    from scanmap.cli.report import say
+    from scanmap.cli.terminal import say
 
     for line in session.describe(file):
         say(line)

@@ -2,75 +2,74 @@
 
 from __future__ import annotations
 
-import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
+
+from scanmap.cli.terminal import console, say
 
 if TYPE_CHECKING:
     from scanmap.session import Progress, Result
     from scanmap.session.summary import Summary
 
-console = Console(highlight=False, soft_wrap=True)
-
-
-def say(text: str) -> None:
-    """One line to the user, taken as it is."""
-    console.print(text, markup=False)
+SHOWN_FAULTS = 10
+LINE_EVERY_S = 10.0  # progress in a log file, where no bar can be drawn
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[Progress], None]]:
-    """A bar with time left, bearing and rows found; gives the function that moves it."""
+def progress_bar(work: str, total: int | None) -> Iterator[Callable[[Progress], None]]:
+    """A bar with time left, bearing and rows found; gives the function that moves it.
+
+    Where nobody watches (a pipe, a log file) a line now and then.
+    """
+    if not console.is_terminal:
+        yield _lines(work)
+        return
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("time left"),
-        TimeRemainingColumn(), TextColumn("{task.fields[where]}"),
+        TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("left{task.fields[where]}"),
     )  # fmt: skip
-    with Bar(*columns, console=console) as bar:
-        task = bar.add_task("scanning", total=None, where="")
+    with Bar(*columns, console=console, expand=True) as bar:
+        task = bar.add_task(work, total=total, where="")
 
         def move(progress: Progress) -> None:
-            where = f"bearing {progress.bearing_deg:.2f} deg, {progress.rows_found}/{progress.rows} rows"
+            where = f", bearing {progress.bearing_deg:.2f} deg, {progress.rows_found}/{progress.rows} rows"
             bar.update(task, completed=progress.done, total=progress.total, where=where)
 
         yield move
 
 
-@contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C or SIGTERM asks for an orderly end; gives the function that tells whether it was asked for.
+def _lines(work: str) -> Callable[[Progress], None]:
+    begun = last = time.monotonic()
 
-    A second Ctrl-C interrupts at once.
-    """
-    asked = False
+    def move(progress: Progress) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last < LINE_EVERY_S:
+            return
+        last = now
+        total = progress.total
+        left = f", {(now - begun) * (total / progress.done - 1.0):.0f} s left" if total and progress.done else ""
+        say(
+            f"{work} {progress.done}/{total or '?'}{left}, bearing {progress.bearing_deg:.2f} deg, "
+            f"{progress.rows_found}/{progress.rows} rows"
+        )
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        say("stopping: the head parks, everything scanned is kept (again to stop at once)")
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return move
 
 
 def print_summary(summary: Summary) -> None:
     """Points, ranges, rows without return and why, and the accuracy budget."""
     cells = summary.bearings * summary.rows
     share = 100.0 * summary.points / cells if cells else 0.0
-    say(f"{summary.points} points from {summary.bearings} bearings x {summary.rows} rows ({share:.1f} % of the rows)")
+    bearings = "1 bearing" if summary.bearings == 1 else f"{summary.bearings} bearings"
+    say(f"{summary.points} points from {bearings} x {summary.rows} rows ({share:.1f} % of the rows)")
     if summary.points:
         say(f"range {summary.range_min_m:.3f} to {summary.range_max_m:.3f} m, median {summary.range_median_m:.3f} m")
     if summary.lost:
@@ -91,10 +90,10 @@ def print_summary(summary: Summary) -> None:
 def print_result(result: Result) -> None:
     """Everything a scan or replay ends with."""
     print_summary(result.summary)
-    for fault in result.faults[:10]:
+    for fault in result.faults[:SHOWN_FAULTS]:
         say(f"fault: {fault}")
-    if len(result.faults) > 10:
-        say(f"fault: and {len(result.faults) - 10} more; the recording's /diagnostics has them all")
+    if len(result.faults) > SHOWN_FAULTS:
+        say(f"fault: and {len(result.faults) - SHOWN_FAULTS} more")
     if result.floor_note:
         say(result.floor_note)
     if result.truth is not None:
@@ -107,5 +106,7 @@ def print_result(result: Result) -> None:
         say(f"wrote {path}")
     for path, error in result.unwritten:
         say(f"NOT written {path}: {error}")
-    if result.next_commands:
-        say("next: " + "   ".join(result.next_commands))
+    if result.ended == "interrupted":
+        say(f"interrupted after {result.shots} shots; everything scanned until then is kept")
+    for command in result.next_commands:
+        say(f"next: {command}")

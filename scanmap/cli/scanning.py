@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ import typer
 from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
 
 if TYPE_CHECKING:
-    from scanmap.session import Result
+    from scanmap.session import Job
 
 OutOption = Annotated[
     list[Path] | None,
@@ -34,27 +35,27 @@ def scan(
     rrd: RrdOption = None,
     view: ViewOption = False,
 ) -> None:
-    """Sweep the rig and write what it sees. Without --config the rig is the digital twin: no hardware needed.
+    """Sweep the rig and write what it sees.
+
+    Without --config the rig is the digital twin: no hardware needed.
 
     Example: scanmap scan --out room.ply --map room.yaml
     """
     from scanmap import session
-    from scanmap.cli.report import progress_bar, say, stop_on_signal
     from scanmap.errors import ConfigError
 
     if record is not None and no_record:
         raise ConfigError("--record and --no-record exclude each other; give one")
     outputs = session.Outputs.of_scan(tuple(out or ()), map_, record, rrd, keep=not no_record)
-    with session.prepare_scan(session.Choice(config, tuple(set_ or ()), calibration), outputs, view=view) as job:
-        for line in job.announcement:
-            say(line)
-        with stop_on_signal() as stop, progress_bar() as progress:
-            result = job.run(progress, stop)
-    _finish(result)
+    choice = session.Choice(config, tuple(set_ or ()), calibration)
+    words = "stopping: the head parks, everything scanned is kept"
+    _run(lambda: session.prepare_scan(choice, outputs, view=view), "scanning", words)
 
 
 def replay(
-    source: Annotated[Path, typer.Argument(help="A recording (.mcap), a folder with scan.csv, or a video.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A recording (.mcap), a folder with scan.csv, or a video.")
+    ],
     config: ConfigOption = None,
     set_: SetOption = None,
     calibration: CalibrationOption = None,
@@ -66,28 +67,35 @@ def replay(
     rrd: RrdOption = None,
     view: ViewOption = False,
 ) -> None:
-    """Make everything again from a recording, with other settings or another calibration if you like.
+    """Make everything again from a recording.
 
-    With the settings it was recorded with, the result equals the live scan bit for bit.
+    Other settings and another calibration can be given. With the settings it was recorded with, the result
+    equals the live scan bit for bit.
 
-    Example: scanmap replay room.mcap --set laserline.method=cog --out room-cog.ply
+    Example: scanmap replay room.mcap --set laserline.method=cog --out cog.ply
     """
     from scanmap import session
-    from scanmap.cli.report import progress_bar, say, stop_on_signal
 
     outputs = session.Outputs(tuple(out or ()), map_, rrd=rrd)
     choice = session.Choice(config, tuple(set_ or ()), calibration)
-    with session.prepare_replay(source, choice, outputs, bearings=bearings, view=view) as job:
+    words = "stopping: everything replayed so far is written"
+    _run(
+        lambda: session.prepare_replay(source, choice, outputs, bearings=bearings, view=view),
+        "replaying",
+        words,
+    )
+
+
+def _run(prepare: Callable[[], Job], work: str, words: str) -> None:
+    """Open a job, run it, say how it ended, and exit with the code for that."""
+    from scanmap.cli.report import print_result, progress_bar
+    from scanmap.cli.terminal import say, stop_on_signal
+
+    with stop_on_signal() as stop, prepare() as job:
         for line in job.announcement:
             say(line)
-        with stop_on_signal() as stop, progress_bar() as progress:
-            result = job.run(progress, stop)
-    _finish(result)
-
-
-def _finish(result: Result) -> None:
-    from scanmap.cli.report import print_result
-
+        with progress_bar(work, job.total) as progress:
+            result = job.run(progress, stop.orderly(words))
     print_result(result)
     if result.error is not None:
         raise result.error

@@ -19,7 +19,11 @@ CalibrationOption = Annotated[
 
 
 def config(config: ConfigOption = None, set_: SetOption = None) -> None:
-    """Print the effective configuration as TOML, every key with its unit, meaning and limits."""
+    """Print the effective configuration as TOML.
+
+    Every key has its unit, meaning and limits beside it: redirect it to a file for a rig's TOML of your own.
+    """
+    from scanmap.cli.terminal import output
     from scanmap.config import load
 
-    print(load(config, set_ or ()).explained(), end="")
+    output.write(load(config, set_ or ()).explained())

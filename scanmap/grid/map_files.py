@@ -58,11 +58,22 @@ def save_map(
         raise ConfigError(f"map mode scale marks unknown cells by transparency, which {image_format} lacks; use png")
     image = np.flipud(_trinary_pixels(grid) if mode == "trinary" else _scale_pixels(grid))
     image_path = path.with_suffix(f".{image_format}")
+    content = {
+        image_path: cv2.imencode(f".{image_format}", image)[1].tobytes(),
+        path: _yaml(grid, image_path.name, mode).encode(),
+    }
+    partial = {target: target.with_name(f".{target.name}.part") for target in content}
     try:
-        image_path.write_bytes(cv2.imencode(f".{image_format}", image)[1].tobytes())
-        path.write_text(_yaml(grid, image_path.name, mode), encoding="utf-8")
+        # Both whole or neither: a YAML beside half an image would still load.
+        for target, data in content.items():
+            partial[target].write_bytes(data)
+        for target in content:
+            partial[target].replace(target)
     except OSError as error:
         raise ConfigError(f"map {path} cannot be written: {error.strerror}; choose another --map") from error
+    finally:
+        for part in partial.values():
+            part.unlink(missing_ok=True)
     return [path, image_path]
 
 

@@ -1,6 +1,7 @@
 """Opens what a config names, runs it, writes it, and holds it against the twin's truth; for cli and panel."""
 
-from scanmap.session.inspection import describe, make_map, map_settings, prepare_view, watch
+from scanmap.session.description import describe
+from scanmap.session.inspection import map_lines, map_of_cloud, map_settings, prepare_view, shown_as_it_is, watch
 from scanmap.session.job import Job, Progress, Result
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
@@ -13,11 +14,13 @@ __all__ = [
     "Progress",
     "Result",
     "describe",
-    "make_map",
+    "map_lines",
+    "map_of_cloud",
     "map_settings",
     "prepare_replay",
     "prepare_scan",
     "prepare_view",
     "show",
+    "shown_as_it_is",
     "watch",
 ]

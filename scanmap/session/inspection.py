@@ -1,33 +1,38 @@
-"""Looking at what is there: what a file holds, a map of an old scan, the viewer."""
+"""Looking at what was scanned: the viewer, and a map of an old scan."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from scanmap import recording
-from scanmap.calibration import Calibration
 from scanmap.errors import ConfigError, RecordingError
-from scanmap.grid import OccupancyGrid, load_map, save_map
+from scanmap.grid import OccupancyGrid, save_map
 from scanmap.scan.formats import read_ply
-from scanmap.session.job import Job, Progress
+from scanmap.session.job import Job, Result
 from scanmap.session.outputs import Outputs
-from scanmap.session.preparing import Choice, prepare_replay
-from scanmap.session.summary import summarise
+from scanmap.session.preparing import Choice, prepare_replay, require_display
 from scanmap.view import show
+
+# What the viewer opens without a recording to make a view of.
+SHOWN_AS_THEY_ARE = (".rrd", ".ply", ".glb", ".stl", ".obj")
+
+
+def shown_as_it_is(path: Path) -> bool:
+    """Whether the viewer opens this file directly: a view, a cloud or a mesh."""
+    return path.suffix.lower() in SHOWN_AS_THEY_ARE
 
 
 def prepare_view(source: Path, choice: Choice, save: Path | None) -> Job:
     """A replay that leaves nothing but an .rrd: `save`, or a temporary file that lives as long as the job."""
-    folder = TemporaryDirectory(prefix="scanmap-") if save is None else None
-    rrd = save if folder is None else Path(folder.name) / f"{source.stem or 'scan'}.rrd"
-    job = prepare_replay(source, choice, Outputs(rrd=rrd))
-    if folder is not None:
+    if save is None:
+        require_display("write a file with --save F.rrd and open it where there is one with scanmap view F.rrd")
+        folder = TemporaryDirectory(prefix="scanmap-")
+        job = prepare_replay(source, choice, Outputs(rrd=Path(folder.name) / f"{source.stem or 'scan'}.rrd"))
         job.closers.append(folder.cleanup)
-    return job
+        return job
+    return prepare_replay(source, choice, Outputs(rrd=save))
 
 
 def watch(port: int) -> None:
@@ -54,50 +59,35 @@ def map_settings(resolution_m: float | None, height_m: str | None) -> list[str]:
     return settings
 
 
-def make_map(
-    source: Path, choice: Choice, outputs: Outputs, progress: Callable[[Progress], None], stop: Callable[[], bool]
-) -> list[str]:
-    """Write the map of a recording, a folder of frames or a cloud; returns lines that say what was done.
-
-    Args:
-        outputs: the map alone.
-    """
-    if outputs.map is None:
-        raise ConfigError("no map named; give --out room.yaml")
-    if source.suffix == ".ply":
-        outputs.check()
-        grid = OccupancyGrid.from_scan(read_ply(source), choice.load().grid)
-        save_map(grid, outputs.map, image_format=outputs.map_image, mode=outputs.map_mode)
-        return [*grid_lines(grid), f"wrote {outputs.map}"]
-    with prepare_replay(source, choice, outputs) as job:
-        result = job.run(progress, stop)
-    if result.error is not None:
-        raise result.error
-    if result.grid is None:
-        raise RecordingError(f"{source} gives no point to make a map of; scanmap replay {source} says why")
-    if result.unwritten:
-        raise RecordingError(result.unwritten[0][1])
-    return [*(f"fault: {fault}" for fault in result.faults), *grid_lines(result.grid), f"wrote {outputs.map}"]
-
-
-def describe(path: Path) -> list[str]:
-    """What a recording, cloud, map or calibration holds, as lines.
+def map_of_cloud(source: Path, choice: Choice, outputs: Outputs) -> list[str]:
+    """Write the map of a cloud that scanmap wrote; returns lines that say what was done.
 
     Raises:
-        ConfigError: no such file, or of a kind scanmap does not know.
-        RecordingError, CalibrationError: it is damaged.
+        ConfigError, RecordingError: the cloud is missing, damaged, of another program, or empty.
     """
-    if not path.exists():
-        raise ConfigError(f"{path} does not exist; scanmap info wants a recording, cloud, map or calibration")
-    readers: dict[str, Callable[[Path], list[str]]] = {
-        ".ply": _describe_cloud,
-        ".yaml": _describe_map,
-        ".yml": _describe_map,
-        ".toml": _describe_calibration,
-    }
-    if path.suffix in readers:
-        return readers[path.suffix](path)
-    return recording.describe(path).lines
+    outputs.check()
+    if not source.exists():
+        raise ConfigError(f"{source} does not exist; scanmap map wants a recording, a folder with scan.csv or a cloud")
+    scan = read_ply(source)
+    if outputs.map is None or not scan.valid.any():
+        raise RecordingError(f"{source} holds no point to make a map of")
+    grid = OccupancyGrid.from_scan(scan, choice.load().grid)
+    files = save_map(grid, outputs.map, image_format=outputs.map_image, mode=outputs.map_mode)
+    return [*grid_lines(grid), *(f"wrote {path}" for path in files)]
+
+
+def map_lines(result: Result) -> list[str]:
+    """What a replay made as a map, in lines.
+
+    Raises:
+        Exception: what ended the replay, or kept the map from being written.
+    """
+    if result.unwritten:
+        raise RecordingError(result.unwritten[0][1])
+    if result.grid is None and result.error is not None:
+        raise result.error
+    lines = [f"fault: {fault}" for fault in result.faults]
+    return lines + (grid_lines(result.grid) if result.grid is not None else []) + [f"wrote {p}" for p in result.files]
 
 
 def grid_lines(grid: OccupancyGrid) -> list[str]:
@@ -114,32 +104,3 @@ def grid_lines(grid: OccupancyGrid) -> list[str]:
         "cells: " + ", ".join(f"{name} {share:.1f} %" for name, share in shares.items()),
     ]
     return lines + ([grid.floor.words] if grid.floor is not None else [])
-
-
-def _describe_cloud(path: Path) -> list[str]:
-    scan = read_ply(path)
-    summary = summarise(scan)
-    first, last = np.degrees(scan.bearings[[0, -1]])
-    return [
-        f"cloud {path}: {summary.points} points",
-        f"bearings: {summary.bearings} from {first:.3f} to {last:.3f} deg, {summary.rows} image rows",
-        f"range: {summary.range_min_m:.3f} to {summary.range_max_m:.3f} m, median {summary.range_median_m:.3f} m",
-        *(f"{key}: {value}" for key, value in scan.comments.items()),
-    ]
-
-
-def _describe_map(path: Path) -> list[str]:
-    return [f"map {path}", *grid_lines(load_map(path))]
-
-
-def _describe_calibration(path: Path) -> list[str]:
-    head = Calibration.load(path)
-    own = head.intrinsics
-    return [
-        f"calibration {path}: {own.width}x{own.height} px, fx {own.fx:.2f}, fy {own.fy:.2f}, "
-        f"cx {own.cx:.2f}, cy {own.cy:.2f}",
-        f"baseline {1e3 * head.baseline_m:.2f} mm, beta {np.degrees(head.beta):.3f} deg, "
-        f"half view {np.degrees(head.alpha):.2f} deg",
-        f"head offset {tuple(head.mount.offset_m)} m, axis tilt {tuple(head.mount.tilt_deg)} deg",
-        *(f"{key}: {value}" for table in (head.residuals, head.meta) for key, value in table.items()),
-    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,7 @@ from scanmap.session.summary import Summary, summarise
 from scanmap.shot import Shot
 from scanmap.twin import Truth, TruthReport
 from scanmap.view import View
+from scanmap.view.viewer import has_display
 
 # While a scan runs the viewer's map is made anew this often [shots].
 MAP_EVERY = 20
@@ -47,7 +49,8 @@ class Result:
     grid: OccupancyGrid | None  # None where the scan has no point to make one of
     summary: Summary
     ended: str  # finished, interrupted, or error: ...
-    error: ScanmapError | None = None  # what ended the scan early
+    shots: int = 0  # that were processed; passes and repeated bearings count each
+    error: Exception | None = None  # what ended the scan early, or left nothing to write
     faults: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     unwritten: list[tuple[Path, str]] = field(default_factory=list)
@@ -76,6 +79,7 @@ class Job:
     truth: Truth | None = None
     source_faults: list[str] = field(default_factory=list)
     closers: list[Callable[[], None]] = field(default_factory=list)
+    done: int = 0  # shots processed so far
 
     def __enter__(self) -> Job:
         return self
@@ -85,18 +89,21 @@ class Job:
     ) -> None:
         for close in reversed(self.closers):
             close()
+        self._leave_nothing_empty()
 
     def run(self, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> Result:
         """Process every shot and write the results.
 
-        A fault that ends the scan early is in the result's `error`, beside everything scanned before it.
+        A fault that ends the scan early, foreseen or not, is in the result's `error`, beside everything scanned
+        before it.
 
         Raises:
-            ScanmapError: the very first shot failed, so there is nothing to keep.
+            Exception: the very first shot failed, so there is nothing to keep; a ScanmapError where foreseen.
         """
         scan = Scan(self.calibration.mount, self.calibration.intrinsics.height, self.comments)
         faults: list[str] = []
-        ended, error = "finished", None
+        ended = "finished"
+        error: Exception | None = None
         try:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
             sinks = self._sinks(scan, faults, progress)
@@ -105,14 +112,17 @@ class Job:
                 ended = "interrupted"
         except KeyboardInterrupt:
             ended = "interrupted"
-        except ScanmapError as raised:
-            ended, error = f"error: {raised}", raised
+        except Exception as raised:
+            kind = "" if isinstance(raised, ScanmapError) else f"{type(raised).__name__}: "
+            ended, error = f"error: {kind}{raised}", raised
         finally:
             self._close_recording(ended, faults)
         if error is not None and not len(scan):
             raise error
         if not len(scan):
-            raise RecordingError(f"there is no shot to make a scan of ({ended})")
+            if ended == "interrupted":
+                raise KeyboardInterrupt
+            raise RecordingError("there is no shot to make a scan of")
         return self._finished(scan, faults, ended, error)
 
     def _recorded(self) -> Iterator[Shot]:
@@ -123,6 +133,7 @@ class Job:
     def _sinks(self, scan: Scan, faults: list[str], progress: Callable[[Progress], None]) -> list[Sink]:
         def collect(step: Step) -> None:
             scan.add(step.profile, step.shot.bearing)
+            self.done += 1
             if step.fault:
                 faults.append(f"shot {step.shot.index} at {np.degrees(step.shot.bearing):.3f} deg: {step.fault}")
                 if self.recorder is not None:
@@ -153,35 +164,80 @@ class Job:
         except RecordingError as error:
             faults.append(str(error))
 
-    def _finished(self, scan: Scan, faults: list[str], ended: str, error: ScanmapError | None) -> Result:
+    def _finished(self, scan: Scan, faults: list[str], ended: str, error: Exception | None) -> Result:
         clean = finished_scan(scan, self.config)
-        grid = OccupancyGrid.from_scan(clean, self.config.grid) if clean.valid.any() else None
-        files, unwritten = write_results(clean, grid, self.outputs)
-        if self.view is not None:
-            self.view.finish(clean, grid)
-            self.view.close()
-            if self.outputs.rrd is not None:
-                files.append(self.outputs.rrd)
+        summary = summarise(clean)
+        grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
+        if summary.points:
+            grid = OccupancyGrid.from_scan(clean, self.config.grid)
+            files, unwritten = write_results(clean, grid, self.outputs)
+        else:
+            error = error or RecordingError(self._pointless(summary))
+        self._close_view(clean, grid, files, unwritten)
         if self.recorder is not None:
             files.append(self.recorder.path)
         return Result(
             scan=clean,
             grid=grid,
-            summary=summarise(clean),
+            summary=summary,
             ended=ended,
+            shots=self.done,
             error=error,
             faults=[*self.source_faults, *faults],
             files=files,
             unwritten=unwritten,
             truth=self.truth.compare(clean.points[clean.valid], clean.bearings) if self.truth is not None else None,
-            next_commands=self._next_commands(),
+            next_commands=self._next_commands(files),
         )
 
-    def _next_commands(self) -> list[str]:
-        if self.recorder is None:
-            return []
-        path = self.recorder.path
-        return [f"scanmap view {path}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
+    def _close_view(
+        self, scan: Scan, grid: OccupancyGrid | None, files: list[Path], unwritten: list[tuple[Path, str]]
+    ) -> None:
+        if self.view is None:
+            return
+        self.view.finish(scan, grid)
+        self.view.close()
+        if self.outputs.rrd is not None and self.view.whole:
+            files.append(self.outputs.rrd)
+        elif self.outputs.rrd is not None:
+            unwritten.append((self.outputs.rrd, "it has no end; is the disk full?"))
+
+    def _leave_nothing_empty(self) -> None:
+        """Close what is still open; a recording or view without a single shot is not worth a file."""
+        if self.view is not None:
+            self.view.close()
+            if not self.done and self.outputs.rrd is not None:
+                self.outputs.rrd.unlink(missing_ok=True)
+        if self.recorder is not None:
+            self._close_recording("interrupted", [])
+            if not self.recorder.shots:
+                self.recorder.path.unlink(missing_ok=True)
+
+    def _pointless(self, summary: Summary) -> str:
+        reasons = ", ".join(reason.words for reason in summary.lost)
+        shots = "the only shot" if self.done == 1 else f"any of {self.done} shots"
+        return (
+            f"no laser line found in {shots} ({reasons}), so there is no cloud or map to write; look at the images: is "
+            f"the laser on, the line between {self.config.triangulation.range_min_m:g} and "
+            f"{self.config.triangulation.range_max_m:g} m, laserline.min_peak = "
+            f"{self.config.laserline.min_peak:g} low enough?"
+        )
+
+    def _next_commands(self, files: list[Path]) -> list[str]:
+        if self.recorder is not None:
+            path = shlex.quote(str(self.recorder.path))
+            rrd = shlex.quote(str(self.recorder.path.with_name(f"{self.recorder.path.stem}.rrd")))
+            look = path if has_display() else f"{path} --save {rrd}"
+            return [f"scanmap view {look}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
+        clouds = [shlex.quote(str(path)) for path in files if path in self.outputs.clouds and is_scan_file(path)]
+        maps = [shlex.quote(str(path)) for path in files if path == self.outputs.map]
+        commands = [f"scanmap info {path}" for path in (*clouds[:1], *maps)]
+        return commands if maps else [*commands, *(f"scanmap map {cloud} --out map.yaml" for cloud in clouds[:1])]
+
+
+def is_scan_file(path: Path) -> bool:
+    """Whether a cloud keeps the range image, so that a map can be made of it."""
+    return path.suffix.lower() == ".ply" and not path.name.lower().endswith("mesh.ply")
 
 
 def finished_scan(scan: Scan, config: Config) -> Scan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,21 +33,23 @@ class Outputs:
 
         A recording is never overwritten: where room.mcap exists, the new one is room-2.mcap.
         """
-        stem = clouds[0].with_suffix("") if clouds else Path("scan")
+        cls(clouds).refuse_folders()
+        first = clouds[0] if clouds else Path("scan.ply")
         if record is not None and record.exists():
             raise ConfigError(f"recording {record} exists and is not overwritten; give another --record or move it")
         if record is None and keep:
-            record = stem.with_suffix(".mcap")
+            record = first.with_name(f"{first.stem}.mcap")
             number = 2
             while record.exists():
-                record = stem.with_name(f"{stem.name}-{number}.mcap")
+                record = first.with_name(f"{first.stem}-{number}.mcap")
                 number += 1
         if map_ is None and clouds:
-            map_ = stem.with_suffix(".yaml")
+            map_ = first.with_name(f"{first.stem}.yaml")
         return cls(clouds, map_, record, rrd)
 
     def check(self) -> None:
         """Raise ConfigError unless every file can be written; before a scan is wasted on it."""
+        self.refuse_folders()
         for path in self.clouds:
             check_writable(path)
         expected = ((self.map, ".yaml", "--map"), (self.record, ".mcap", "--record"), (self.rrd, ".rrd", "--rrd"))
@@ -58,9 +61,28 @@ class Outputs:
                     f"{option} {path_or_none}: must end in {suffix}; try {path_or_none.with_suffix(suffix)}"
                 )
             check_writable(path_or_none, suffixes=(suffix,))
-        asked = [path for path in (*self.clouds, self.map, self.record, self.rrd) if path is not None]
-        if len(set(asked)) < len(asked):
-            raise ConfigError("two outputs have the same name; give each its own")
+        if self.map_mode == "scale" and self.map_image != "png":
+            raise ConfigError(
+                f"--mode scale marks unknown cells by transparency, {self.map_image} has none: --image png"
+            )
+        self._refuse_twins()
+
+    def refuse_folders(self) -> None:
+        """Raise ConfigError where a folder was named as a file."""
+        for path in (*self.clouds, self.map, self.record, self.rrd):
+            if path is not None and (path.is_dir() or path.name in ("", "..")):
+                raise ConfigError(f"{path} is a folder; give the name of a file in it")
+
+    def _refuse_twins(self) -> None:
+        image = self.map.with_suffix(f".{self.map_image}") if self.map is not None else None
+        seen: set[str] = set()
+        for path in (*self.clouds, self.map, image, self.record, self.rrd):
+            if path is None:
+                continue
+            name = os.path.realpath(path)
+            if name in seen:
+                raise ConfigError(f"two outputs have the name {path}; give each its own")
+            seen.add(name)
 
 
 def write_results(
@@ -77,7 +99,9 @@ def write_results(
     def attempt(path: Path, action: Callable[[], list[Path] | None]) -> None:
         try:
             written.extend(action() or [path])
-        except (ScanmapError, OSError) as error:
+        except OSError as error:
+            failed.append((path, error.strerror or str(error)))
+        except ScanmapError as error:
             failed.append((path, str(error)))
 
     for path in outputs.clouds:

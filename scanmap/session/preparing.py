@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -11,13 +13,18 @@ from typing import Any
 from scanmap import config as configuration
 from scanmap.calibration import Calibration
 from scanmap.config import Config
-from scanmap.errors import ConfigError
+from scanmap.errors import ConfigError, RecordingError
 from scanmap.recording import Recorder, Source, open_source
+from scanmap.recording.opening import KINDS
+from scanmap.recording.video import VIDEO_SUFFIXES
 from scanmap.session.job import Job
 from scanmap.session.outputs import Outputs
 from scanmap.session.rigs import TWIN_NAME, open_twin
 from scanmap.sweep import plan, sweep
-from scanmap.view import View, open_view, show
+from scanmap.view import open_view, show
+from scanmap.view.viewer import has_display
+
+INSTEAD_OF_VIEW = "leave --view out, give --rrd F.rrd, and open that where there is one with scanmap view F.rrd"
 
 
 @dataclass(frozen=True)
@@ -32,12 +39,25 @@ class Choice:
         """The chosen configuration, or the default."""
         return configuration.load(self.config, self.settings)
 
+    def head(self) -> Calibration | None:
+        """The chosen calibration; None where none was chosen."""
+        if self.calibration is None:
+            return None
+        if not Path(self.calibration).is_file():
+            raise ConfigError(
+                f"--calibration {self.calibration}: there is no such file; leave it out to take the configuration's "
+                "or the recording's own"
+            )
+        return Calibration.load(self.calibration)
+
 
 def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
     """Open the rig that a configuration names, and everything its sweep will be written to.
 
+    What fails here leaves no file behind.
+
     Raises:
-        ConfigError, CalibrationError, StageError, CameraError: before anything turns.
+        ConfigError, CalibrationError, StageError, CameraError, RecordingError: before anything turns.
     """
     config = choice.load()
     if config.rig != "twin":
@@ -46,33 +66,25 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
             f"try scanmap replay SOURCE --config {choice.config}"
         )
     outputs.check()
-    head = Calibration.load(choice.calibration) if choice.calibration else config.head()
-    swept = plan(config.sweep)
+    if view:
+        require_display(INSTEAD_OF_VIEW)
+    head = choice.head() or config.head()
+    swept = plan(config.sweep, _limits(config))
     twin = open_twin(config, head)
-    try:
-        recorder = _recorder(config, head, outputs, swept.as_metadata(), len(swept.bearings))
-        viewer = _open_view(config, head, outputs, title=config.description or TWIN_NAME, is_twin=True, live=view)
-    except BaseException:
-        twin.close()
-        raise
     job = Job(
         config=config,
         calibration=head,
         outputs=outputs,
-        shots=lambda: sweep(twin.rig, config.sweep, sleep=twin.sleep),
+        shots=lambda: sweep(twin.rig, config.sweep, sleep=twin.sleep, clock=twin.clock),
         total=len(swept.bearings),
         comments=_comments(is_twin=True),
-        announcement=[
-            f"DIGITAL TWIN: no hardware is used and the room is made up ({config.twin.room}); "
-            "your own rig: scanmap scan --config my-rig.toml",
-            swept.words,
-        ],
-        recorder=recorder,
-        view=viewer,
+        announcement=[f"DIGITAL TWIN: no hardware is used, the room is made up ({config.twin.room})", swept.words],
         truth=twin.truth,
         closers=[twin.close],
     )
-    _watch_it(job, view)
+    with _opened(job):
+        _open_view(job, title=config.description or TWIN_NAME, is_twin=True, live=view)
+        job.recorder = _recorder(config, head, outputs, swept.as_metadata(), len(swept.bearings))
     return job
 
 
@@ -90,23 +102,48 @@ def prepare_replay(
     Raises:
         ConfigError, CalibrationError, RecordingError: before anything is processed.
     """
+    if not path.exists():
+        raise ConfigError(f"{path} does not exist; scanmap replays {KINDS}")
+    if bearings is not None and path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ConfigError(f"--bearings is for videos ({', '.join(VIDEO_SUFFIXES)}); {path} brings its bearings along")
     config, source = _source(path, bearings, choice)
     outputs.check()
-    head = _head(config, source, choice)
-    viewer = _open_view(config, head, outputs, title=path.name, is_twin=source.is_twin, live=view)
+    if view:
+        require_display(INSTEAD_OF_VIEW)
     job = Job(
         config=config,
-        calibration=head,
+        calibration=choice.head() or (config.head() if config.calibration is not None else source.calibration()),
         outputs=outputs,
         shots=source.shots,
         total=source.count,
         comments=_comments(is_twin=source.is_twin),
         announcement=[_announcement(source)],
-        view=viewer,
         source_faults=source.faults,
     )
-    _watch_it(job, view)
+    with _opened(job):
+        _open_view(job, title=path.name, is_twin=source.is_twin, live=view)
     return job
+
+
+def require_display(instead: str) -> None:
+    """Raise ConfigError with what to do instead, unless a window can be opened here."""
+    if not has_display():
+        raise ConfigError(f"no display to open the viewer on (DISPLAY and WAYLAND_DISPLAY are not set); {instead}")
+
+
+@contextmanager
+def _opened(job: Job) -> Iterator[None]:
+    """Close the job again should its last parts fail to open."""
+    try:
+        yield
+    except BaseException:
+        job.__exit__(None, None, None)
+        raise
+
+
+def _limits(config: Config) -> tuple[float, float]:
+    """How far the head may turn [rad]."""
+    return math.radians(config.stage.min_deg), math.radians(config.stage.max_deg)
 
 
 def _source(path: Path, bearings: Path | None, choice: Choice) -> tuple[Config, Source]:
@@ -115,14 +152,13 @@ def _source(path: Path, bearings: Path | None, choice: Choice) -> tuple[Config, 
         config = choice.load()
         return config, open_source(path, config.recording, bearings=bearings)
     topics = [setting for setting in choice.settings if setting.startswith("recording.")]
-    source = open_source(path, configuration.parse("", "settings", topics).recording, bearings=bearings)
-    return configuration.parse(source.rig_toml, f"configuration in {path}", choice.settings), source
-
-
-def _head(config: Config, source: Source, choice: Choice) -> Calibration:
-    if choice.calibration is not None:
-        return Calibration.load(choice.calibration)
-    return config.head() if config.calibration is not None else source.calibration()
+    source = open_source(path, configuration.parse("", "--set", topics).recording, bearings=bearings)
+    name = f"configuration in {path}"
+    try:
+        configuration.parse(source.rig_toml, name)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; or replay it with a configuration of your own: --config FILE|PRESET") from error
+    return configuration.parse(source.rig_toml, name, choice.settings), source
 
 
 def _comments(*, is_twin: bool) -> dict[str, Any]:
@@ -133,9 +169,9 @@ def _comments(*, is_twin: bool) -> dict[str, Any]:
 
 
 def _announcement(source: Source) -> str:
-    shots = f"{source.count} shots" if source.count is not None else "shots"
+    shots = "1 shot" if source.count == 1 else f"{'' if source.count is None else f'{source.count} '}shots"
     made_up = "; DIGITAL TWIN, its room is made up" if source.is_twin else ""
-    ended = f", which ended: {source.end_reason}" if source.end_reason not in ("", "finished") else ""
+    ended = {"": "", "finished": "", "cut": ", which is cut"}.get(source.end_reason, f", {source.end_reason}")
     return f"replaying {shots} of {source.path}{ended}{made_up}"
 
 
@@ -146,41 +182,37 @@ def _recorder(
         return None
     # The attached configuration leaves its calibration to the calibration's own attachment.
     rig_toml = config.model_copy(update={"calibration": None}).dumps()
-    return Recorder(
-        outputs.record,
-        calibration=head,
-        source=TWIN_NAME,
-        rig_toml=rig_toml,
-        plan=planned,
-        expected_shots=shots,
-        params=config.recording,
-    )
+    was_there = outputs.record.exists()
+    try:
+        return Recorder(
+            outputs.record,
+            calibration=head,
+            source=TWIN_NAME,
+            rig_toml=rig_toml,
+            plan=planned,
+            expected_shots=shots,
+            params=config.recording,
+        )
+    except RecordingError:
+        if not was_there:
+            outputs.record.unlink(missing_ok=True)
+        raise
 
 
-def _open_view(
-    config: Config, head: Calibration, outputs: Outputs, *, title: str, is_twin: bool, live: bool
-) -> View | None:
-    if outputs.rrd is None and not live:
-        return None
-    return open_view(
-        calibration=head,
+def _open_view(job: Job, *, title: str, is_twin: bool, live: bool) -> None:
+    """Give the job its view, if one was asked for, and open the viewer on a live one."""
+    config = job.config
+    if job.outputs.rrd is None and not live:
+        return
+    job.view = open_view(
+        calibration=job.calibration,
         params=config.view,
         settings_toml=config.dumps(),
         title=title,
         is_twin=is_twin,
-        rrd=outputs.rrd,
+        rrd=job.outputs.rrd,
         live_port=config.view.live_port if live else None,
         laserline=config.laserline,
     )
-
-
-def _watch_it(job: Job, view: bool) -> None:
-    if not view:
-        return
-    try:
-        show(job.config.view.live_port)
-    except ConfigError:
-        if job.view is not None:
-            job.view.close()
-        job.__exit__(None, None, None)
-        raise
+    if live:
+        show(config.view.live_port)

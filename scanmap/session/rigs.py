@@ -16,6 +16,7 @@ from scanmap.twin.ports import plug
 
 # What everything made from the twin says of its source; `recording.layout` has the same words.
 TWIN_NAME = "digital twin"
+FRAME_PERIOD_S = 1 / 30
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class TwinRig:
     rig: Rig
     truth: Truth
     sleep: Callable[[float], None]  # passes the board's time: a fast-forward twin waits for nothing
+    clock: Callable[[], float]  # the board's time, which frames are stamped with [s]
     close: Callable[[], None]
 
 
@@ -42,13 +44,25 @@ def open_twin(config: Config, calibration: Calibration) -> TwinRig:
         url = opened.enter_context(plug(firmware))
         stage = open_stage(config.stage.model_copy(update={"kind": "grbl", "port": url}))
         opened.callback(stage.close)
+
+        def exposed() -> tuple[float, bool]:
+            if config.sweep.mode == "continuous":  # the head turns on while the next frame comes
+                firmware.wait(FRAME_PERIOD_S)
+            return firmware.bearing, lit_for_ever or firmware.laser_on
+
         camera = TwinCamera(
             scene,
             calibration,
             config.twin,
-            state=lambda: (firmware.bearing, lit_for_ever or firmware.laser_on),
+            state=exposed,
             clock=lambda: firmware.now,
         )
         rig = Rig(camera, stage, TWIN_NAME, is_twin=True)
-        return TwinRig(rig, Truth(scene, calibration, config.twin.laser), firmware.wait, opened.pop_all().close)
+        return TwinRig(
+            rig,
+            Truth(scene, calibration, config.twin.laser),
+            firmware.wait,
+            lambda: firmware.now,
+            opened.pop_all().close,
+        )
     raise AssertionError("unreachable")

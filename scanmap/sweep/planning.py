@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 from scanmap.errors import ConfigError
 
 CABLE_LIMITS = (0.0, math.pi)  # [rad] a head turned further winds up its camera's cable
+MAX_BEARINGS = 1_000_000  # of a sweep; a finer one is a slip of the keyboard
 FRAME_S = 0.1  # a typical camera, for the estimate before the first frame
 TURN_RAD_S = math.radians(20.0)  # a typical head, for the same
 
@@ -85,11 +86,19 @@ def plan(params: SweepParams, limits: tuple[float, float] = CABLE_LIMITS) -> Pla
                 "bearing inside, or set stage.min_deg / stage.max_deg if nothing can"
             )
     span = params.end_deg - params.start_deg
+    if abs(span) / params.step_deg > MAX_BEARINGS:
+        raise ConfigError(
+            f"sweep.step_deg = {params.step_deg:g} makes more than {MAX_BEARINGS} bearings; "
+            f"take {abs(span) / MAX_BEARINGS:g} or more"
+        )
     count = math.floor(abs(span) / params.step_deg + 1e-9) + 1
     forward = np.radians(params.start_deg + math.copysign(params.step_deg, span) * np.arange(count))
     passes = {"forward": 1, "forward-backward": 2}.get(str(params.passes), params.passes)
-    if not isinstance(passes, int) or passes < 1:
-        raise ConfigError(f"sweep.passes = {params.passes!r}: choose forward, forward-backward or a number from 1")
+    if not isinstance(passes, int) or not 1 <= passes <= MAX_BEARINGS // count:
+        raise ConfigError(
+            f"sweep.passes = {params.passes!r}: choose forward, forward-backward or a number from 1 "
+            f"to {MAX_BEARINGS // count}"
+        )
     bearings = np.concatenate([forward if number % 2 == 0 else forward[::-1] for number in range(passes)])
     turning = float(np.abs(np.diff(bearings)).sum())
     if params.mode == "continuous":

@@ -71,6 +71,7 @@ class View:
         rrd: Path | None,
     ) -> None:
         self.alive = True
+        self.whole = True  # False once it is known that the .rrd lacks its end
         self._recording = recording
         self._calibration = calibration
         self._params = params
@@ -157,6 +158,7 @@ class View:
 
             rr.unregister_shutdown()  # it would wait for the same thing when the program ends
         if closing.is_alive() or (self._rrd is not None and not is_whole(self._rrd)):
+            self.whole = False
             self.complain(f"{self._rrd} could not be written to its end; is the disk full?")
 
     def __enter__(self) -> View:

@@ -57,7 +57,7 @@ def check_port(port: int) -> None:
         except OSError as error:
             raise ConfigError(
                 f"port {port} for the live view cannot be used ({error.strerror}); "
-                f"close the other viewer or choose another, for example --live {free_port()}"
+                f"close the other viewer or choose another, for example --set view.live_port={free_port()}"
             ) from error
 
 

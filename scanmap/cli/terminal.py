@@ -1,0 +1,126 @@
+"""The terminal: standard output that never ends a scan, one-line errors, signals."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+from rich.console import Console
+
+_LOUD_LIBRARIES = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "RUST_LOG": "off"}
+
+
+class SteadyOutput:
+    """Standard output which falls silent when its reader has gone or its disk is full: a scan goes on.
+
+    `error` keeps what happened, unless it was only a reader that had seen enough (`scanmap ... | head`).
+    """
+
+    encoding = "utf-8"
+
+    def __init__(self) -> None:
+        self.silent = False
+        self.error: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write, or do nothing where nobody listens."""
+        self._attempt(lambda: sys.stdout.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, likewise."""
+        if sys.stdout is not None:
+            self._attempt(sys.stdout.flush)
+
+    def isatty(self) -> bool:
+        """Whether a person reads it."""
+        return not self.silent and sys.stdout is not None and sys.stdout.isatty()
+
+    def fileno(self) -> int:
+        """Of standard output itself."""
+        return sys.stdout.fileno()
+
+    def _attempt(self, action: Callable[[], object]) -> None:
+        if self.silent or sys.stdout is None:
+            return
+        try:
+            action()
+        except (OSError, ValueError) as error:
+            self.silent = True
+            if isinstance(error, OSError) and error.errno not in (errno.EPIPE, errno.EBADF):
+                self.error = error
+            # The interpreter flushes once more when it ends, and would complain.
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+output = SteadyOutput()
+console = Console(file=output, highlight=False, emoji=False)  # type: ignore[arg-type]
+
+
+def say(text: str) -> None:
+    """One line to the user, taken as it is; broken at words where a person reads it, never in a pipe."""
+    console.print(text, markup=False, soft_wrap=not console.is_terminal)
+
+
+def complain(text: str) -> None:
+    """One line on standard error, whatever line breaks the text has."""
+    with suppress(OSError, ValueError, AttributeError):
+        print(f"scanmap: {' '.join(text.split())}", file=sys.stderr)
+
+
+class _ToStderr(logging.Handler):
+    """Log lines to standard error as it is now: a progress bar may stand there."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError, ValueError, AttributeError):
+            print(self.format(record), file=sys.stderr)
+
+
+def set_up_logging(debug: bool) -> None:
+    """Warnings only, or with `debug` everything of scanmap's own; libraries stay as quiet as they can be."""
+    if not debug:
+        for name, value in _LOUD_LIBRARIES.items():
+            os.environ.setdefault(name, value)
+    handler = _ToStderr()
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s" if debug else "warning: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger("scanmap").setLevel(logging.DEBUG if debug else logging.WARNING)
+
+
+class Stop:
+    """Whether Ctrl-C or SIGTERM asked for an end; orderly once `orderly` was called, at once before it."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._words = ""
+
+    def orderly(self, words: str) -> Callable[[], bool]:
+        """From here on the first signal says `words` and only asks; gives what tells whether it did."""
+        self._words = words
+        return lambda: self.asked
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal."""
+        if self.asked or not self._words:
+            raise KeyboardInterrupt
+        self.asked = True
+        say(f"{self._words} (once more to stop at once)")
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Stop]:
+    """Take Ctrl-C and SIGTERM; a second one interrupts at once."""
+    stop = Stop()
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
