@@ -103,6 +103,18 @@ def test_mount_bearings_and_comments_of_any_kind_survive(tmp_path, seed, offset,
     assert max(len(line) for line in header.split(b"\n")) < 256  # readers in C have short buffers
 
 
+def test_a_long_comment_is_spread_over_lines(tmp_path, scan):
+    fields = {name: getattr(scan, name) for name in (*FIELDS, "reason")}
+    rig = "[sweep]\nstep_deg = 1.0  # Grad über alles\n" * 100
+    told = Scan.from_arrays(MOUNT, scan.bearings, fields, {"rig": rig, "words": "x y " * 500 + "z"})
+    write(told, tmp_path / "told.ply")
+    assert_restored(read_ply(tmp_path / "told.ply"), told)
+    header = (tmp_path / "told.ply").read_bytes().split(b"\nend_header\n")[0]
+    assert max(len(line) for line in header.split(b"\n")) < 256
+    cloud = raycast.load_open3d().t.io.read_point_cloud(str(tmp_path / "told.ply"))
+    np.testing.assert_array_equal(cloud.point.positions.numpy(), scan.points[scan.valid])
+
+
 def test_a_comment_cannot_pass_for_the_geometry(tmp_path, scan):
     fields = {name: getattr(scan, name) for name in (*FIELDS, "reason")}
     sly = Scan.from_arrays(MOUNT, scan.bearings, fields, {"rows": 3, "end_header\nelement": "x\nend_header\n"})
@@ -332,10 +344,13 @@ def test_a_missing_file_is_named(tmp_path):
     ("old", "new"),
     [
         (b"comment rows: 48", b"comment rows: 10"),
+        (b"comment rows: 48", b"comment rows: 47"),
         (b"comment rows: 48", b"comment rows: -8"),
         (b"comment rows: 48", b"comment rows: xx"),
         (b"comment tilt_deg: 0.3 -1.7", b"comment tilt_deg: 0.3     "),
         (b"comment rows: 48", b"comment rows: 99999999999"),
+        (b"comment rows: 48", b"comment rows: 900000000"),
+        (b"comment tilt_deg: 0.3 -1.7", b"comment tilt_deg: nan -1.7"),
     ],
 )
 def test_damaged_geometry_is_an_error_not_a_wrong_scan(ply, tmp_path, old, new):
@@ -344,6 +359,21 @@ def test_damaged_geometry_is_an_error_not_a_wrong_scan(ply, tmp_path, old, new):
     path = tmp_path / "damaged.ply"
     path.write_bytes(data.replace(old, new))
     with pytest.raises(RecordingError, match="is damaged"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize(("offset", "words"), [(40, "two points in one cell"), (0, "not finite")])
+def test_records_that_no_scan_has_are_damage(ply, tmp_path, offset, words):
+    """The second point given the first one's bearing and row, or an x that is NaN."""
+    data = bytearray(ply.read_bytes())
+    first = data.index(b"end_header\n") + 11
+    second = first + 48
+    data[second + offset : second + 48] = (
+        data[first + offset : second] if offset else struct.pack("<f", np.nan) + data[second + 4 : second + 48]
+    )
+    path = tmp_path / "damaged.ply"
+    path.write_bytes(bytes(data))
+    with pytest.raises(RecordingError, match=words):
         read_ply(path)
 
 

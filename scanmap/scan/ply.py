@@ -31,7 +31,8 @@ _RESERVED = {*_GEOMETRY, "units", "frame", "sweep"}
 # Readers in C keep a header line in a buffer of 1024 bytes or less.
 _LINE = 200
 _NUMBERS_A_LINE = 8
-_MAX_CELLS = 2**30
+# More than any camera and stage give; a damaged header must not take the machine's memory.
+_MAX_ROWS, _MAX_CELLS = 20_000, 2**27
 
 
 def write_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
@@ -156,8 +157,10 @@ def _scan_of(vertices: NDArray[Any], facts: dict[str, str]) -> Scan:
         [float(number) for number in facts[key].split()] for key in ("head_offset_m", "tilt_deg", "bearings_rad")
     )
     rows = int(facts["rows"])
-    if len(offset) != 3 or len(tilt) != 2 or rows < 1 or rows * len(bearings) > _MAX_CELLS:
+    if len(offset) != 3 or len(tilt) != 2 or not 1 <= rows <= _MAX_ROWS or rows * len(bearings) > _MAX_CELLS:
         raise ValueError(f"its comments give {rows} rows, {len(bearings)} bearings, offset {offset}, tilt {tilt}")
+    if not np.isfinite([*offset, *tilt, *bearings]).all():
+        raise ValueError("a bearing, head_offset_m or tilt_deg that is not finite")
     at = vertices["bearing_index"], vertices["row"]
     if len(vertices) and min(at[0].min(), at[1].min()) < 0:
         raise ValueError("negative bearing_index or row")
@@ -175,6 +178,10 @@ def _scan_of(vertices: NDArray[Any], facts: dict[str, str]) -> Scan:
     ):  # fmt: skip
         values.reshape(-1)[cell] = vertices[name]
     scan.reason.reshape(-1)[cell] = Reason.OK
+    if np.count_nonzero(scan.valid) < len(vertices):
+        raise ValueError("two points in one cell of the range image")
+    if not np.isfinite(points[cell]).all():
+        raise ValueError("a point whose x, y or z is not finite")
     return scan
 
 
