@@ -9,11 +9,11 @@ from scanmap import session
 
 DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 
-# A small head and coarse steps: everything is exercised, in seconds.
+# A smaller head and coarse steps: everything is exercised, in seconds.
 SMALL = (
-    "calibration.image.width=640",
-    "calibration.image.height=480",
-    "sweep.step_deg=6.0",
+    "calibration.image.width=1280",
+    "calibration.image.height=960",
+    "sweep.step_deg=5.0",
 )
 
 
