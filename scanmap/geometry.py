@@ -108,7 +108,7 @@ def intersect_rays_plane(origin: Array, directions: Array, plane: Array) -> Arra
     NaN where a ray is parallel to the plane; negative behind the origin.
     """
     along = directions @ plane[:3]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         t = -(plane[:3] @ origin + plane[3]) / along
     met: Array = np.where(np.isfinite(t), t, np.nan)
     return met

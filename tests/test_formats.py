@@ -115,6 +115,12 @@ def test_a_long_comment_is_spread_over_lines(tmp_path, scan):
     np.testing.assert_array_equal(cloud.point.positions.numpy(), scan.points[scan.valid])
 
 
+def test_a_scan_written_in_several_blocks_comes_back(tmp_path):
+    scan = box_scan(np.arange(0.0, 150.0, 1.0), 12)
+    write(scan, tmp_path / "long.ply")
+    assert_restored(read_ply(tmp_path / "long.ply"), scan)
+
+
 def test_a_comment_cannot_pass_for_the_geometry(tmp_path, scan):
     fields = {name: getattr(scan, name) for name in (*FIELDS, "reason")}
     sly = Scan.from_arrays(MOUNT, scan.bearings, fields, {"rows": 3, "end_header\nelement": "x\nend_header\n"})
@@ -421,6 +427,16 @@ def test_a_folder_that_takes_no_file_is_named():
         pytest.skip("needs /proc, a folder in which nobody can create a file")
     with pytest.raises(ConfigError, match=r"room\.ply cannot be written: /proc/self: .*choose another folder"):
         check_writable("/proc/self/room.ply")
+
+
+def test_who_reads_the_old_file_reads_it_whole(scan, tmp_path):
+    """The new file takes the name; the old one is never written into."""
+    path, old = tmp_path / "room.ply", tmp_path / "old.ply"
+    path.write_bytes(b"an older scan")
+    os.link(path, old)
+    write(scan, path)
+    assert old.read_bytes() == b"an older scan"
+    assert len(read_ply(path)) == len(scan)
 
 
 @pytest.mark.parametrize("ending", [*CLOUDS, *MESHES])

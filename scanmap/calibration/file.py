@@ -1,18 +1,16 @@
-"""`Calibration`: the one file that describes a head, and its TOML. No solver lives here."""
+"""The form of calibration.toml: its tables, their limits, every fault named at once."""
 
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError, field_validator, model_validator
 
+from scanmap.calibration.camera import Intrinsics
+from scanmap.calibration.head import Calibration, PixelAngleModel, RatioModel
 from scanmap.errors import CalibrationError
 from scanmap.geometry import HeadMount, is_rotation, rigid, rotation_z
 
@@ -22,203 +20,50 @@ Array = NDArray[np.float64]
 R_HEAD_CAMERA_FORWARD: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """Pinhole with Brown-Conrady distortion, OpenCV's convention, pixels; pixel centres at integers."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 k3
-
-    @cached_property
-    def matrix(self) -> Array:
-        """(3, 3) camera matrix."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-    @property
-    def distorted(self) -> bool:
-        """Whether any distortion coefficient differs from zero."""
-        return any(self.distortion)
-
-    def rays(self, column: Array, row: Array) -> Array:
-        """Directions (..., 3) with z = 1 in the camera frame of pixels `column`, `row` (...,); NaN passes.
-
-        NaN too where no ray comes out at the pixel: a polynomial that folds over inside the image.
-        """
-        if not self.distorted:
-            x = (column - self.cx) / self.fx
-            y = (row - self.cy) / self.fy
-            return np.stack([x, y, np.ones_like(x)], axis=-1)
-        shape = np.shape(column)
-        known = np.isfinite(column).ravel()
-        xy = np.full((known.size, 2), np.nan)
-        if known.any():
-            pixels = np.stack([column.ravel()[known], row.ravel()[known]], axis=-1)
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-            found = cv2.undistortPoints(
-                pixels[:, None], self.matrix, np.array(self.distortion), None, None, None, criteria
-            )[:, 0]
-            back = self.project(np.concatenate([found, np.ones((len(found), 1))], axis=1))
-            found[~(np.abs(back - pixels).max(axis=1) < 1e-3)] = np.nan
-            xy[known] = found
-        return np.concatenate([xy, np.ones((known.size, 1))], axis=1).reshape(*shape, 3)
-
-    def project(self, points_cam: Array) -> Array:
-        """Pixels (..., 2) column, row of points (..., 3) [m] in the camera frame; NaN behind the camera."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = np.where(points_cam[..., 2] > 0, points_cam[..., 2], np.nan)
-            x, y = points_cam[..., 0] / z, points_cam[..., 1] / z
-        k1, k2, p1, p2, k3 = self.distortion
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
+def parse(text: str, source: str) -> Calibration:
+    """`Calibration.loads`."""
+    try:
+        # Strictly, so that text is never taken for a number; a TOML array is a tuple here.
+        return CalibrationFile.model_validate(_with_tuples(tomllib.loads(text)), strict=True).build()
+    except tomllib.TOMLDecodeError as error:
+        raise CalibrationError(f"{source} is not valid TOML: {error}") from error
+    except ValidationError as error:
+        raise CalibrationError(f"{source}: {'; '.join(_faults(error))}") from error
 
 
-@dataclass(frozen=True)
-class RatioModel:
-    """Algorithm 1 of the thesis, the pixel ratio: d = x / ((tan a + tan b) - 2 p tan a)."""
+def dumps(calibration: Calibration) -> str:
+    """`Calibration.dumps`."""
+    import tomli_w
 
-    alpha_deg: float  # half the horizontal field of view
-    beta_deg: float  # inward yaw of the camera
-    baseline_m: float
-    width: int  # [px] image width l
-
-
-@dataclass(frozen=True)
-class PixelAngleModel:
-    """Algorithm 2 of the thesis, the pixel angle: theta = rpc ppx + ro, d = x / tan(theta)."""
-
-    rpc_deg: float  # [deg per px]; the thesis gives degrees though it says radians
-    ro_deg: float  # [deg]
-    baseline_m: float
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A head: camera, laser plane, axis, and what the thesis's two models were fitted to."""
-
-    intrinsics: Intrinsics
-    T_head_camera: Array  # (4, 4)
-    laser_plane: Array  # (4,) n.x + d = 0 in the head frame, |n| = 1, metres
-    mount: HeadMount = field(default_factory=HeadMount)
-    ratio: RatioModel | None = None
-    pixel_angle: PixelAngleModel | None = None
-    residuals: dict[str, Any] = field(default_factory=dict)
-    covariance: dict[str, Any] = field(default_factory=dict)
-    meta: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def baseline_m(self) -> float:
-        """Distance of the camera's centre from the laser plane [m]."""
-        return abs(float(self.laser_plane[:3] @ self.T_head_camera[:3, 3] + self.laser_plane[3]))
-
-    @property
-    def alpha(self) -> float:
-        """Half the horizontal field of view [rad], alpha of the thesis; distortion left aside."""
-        return float(np.arctan(0.5 * self.intrinsics.width / self.intrinsics.fx))
-
-    @property
-    def beta(self) -> float:
-        """Inward yaw of the camera against the laser plane [rad], beta of the thesis."""
-        side = np.sign(self.laser_plane[:3] @ self.T_head_camera[:3, 3] + self.laser_plane[3]) or 1.0
-        return float(np.arcsin(np.clip(-side * self.laser_plane[:3] @ self.T_head_camera[:3, 2], -1, 1)))
-
-    def scaled_to(self, width: int, height: int) -> Calibration:
-        """The same head at another resolution of the same field of view (pixel centres at integers)."""
-        old = self.intrinsics
-        sx, sy = width / old.width, height / old.height
-        intrinsics = replace(
-            old, width=width, height=height, fx=old.fx * sx, fy=old.fy * sy,
-            cx=(old.cx + 0.5) * sx - 0.5, cy=(old.cy + 0.5) * sy - 0.5,
-        )  # fmt: skip
-        ratio = replace(self.ratio, width=width) if self.ratio else None
-        angle = self.pixel_angle
-        if angle is not None:
-            # Column u of the old image is (u + 0.5) sx - 0.5 of the new one.
-            half = 0.5 * angle.rpc_deg * (1.0 / sx - 1.0)
-            angle = replace(angle, rpc_deg=angle.rpc_deg / sx, ro_deg=angle.ro_deg + half)
-        return replace(self, intrinsics=intrinsics, ratio=ratio, pixel_angle=angle)
-
-    def check_image(self, width: int, height: int) -> None:
-        """Raise CalibrationError unless images of this size belong to this calibration."""
-        own = self.intrinsics
-        if (width, height) != (own.width, own.height):
-            raise CalibrationError(
-                f"image is {width}x{height}, the calibration is for {own.width}x{own.height}; "
-                f"set the camera to {own.width}x{own.height} or give the calibration of these images "
-                "with --calibration"
-            )
-
-    @classmethod
-    def load(cls, path: Path | str) -> Calibration:
-        """Read a calibration.toml.
-
-        Raises:
-            CalibrationError: missing, not TOML, or a field is missing or wrong; every fault is named.
-        """
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise CalibrationError(f"calibration {path} cannot be read: {error}") from error
-        return cls.loads(text, source=str(path))
-
-    @classmethod
-    def loads(cls, text: str, source: str = "calibration") -> Calibration:
-        """Parse the TOML text of a calibration; `source` names it in errors."""
-        try:
-            # Strictly, so that text is never taken for a number; a TOML array is a tuple here.
-            return CalibrationFile.model_validate(_with_tuples(tomllib.loads(text)), strict=True).build()
-        except tomllib.TOMLDecodeError as error:
-            raise CalibrationError(f"{source} is not valid TOML: {error}") from error
-        except ValidationError as error:
-            raise CalibrationError(f"{source}: {'; '.join(_faults(error))}") from error
-
-    def dumps(self) -> str:
-        """The calibration as TOML text; `loads` gives it back bit for bit."""
-        import tomli_w
-
-        own = self.intrinsics
-        document: dict[str, Any] = {
-            "image": {"width": own.width, "height": own.height},
-            "intrinsics": {
-                "fx": own.fx, "fy": own.fy, "cx": own.cx, "cy": own.cy, "distortion": list(own.distortion),
-            },
-            "head": {
-                "T_head_camera": self.T_head_camera.tolist(),
-                "laser_plane": self.laser_plane.tolist(),
-            },
-            "axis": {
-                "head_offset_m": list(self.mount.offset_m),
-                "tilt_deg": list(self.mount.tilt_deg),
-            },
+    own = calibration.intrinsics
+    document: dict[str, Any] = {
+        "image": {"width": own.width, "height": own.height},
+        "intrinsics": {
+            "fx": own.fx, "fy": own.fy, "cx": own.cx, "cy": own.cy, "distortion": list(own.distortion),
+        },
+        "head": {
+            "T_head_camera": calibration.T_head_camera.tolist(),
+            "laser_plane": calibration.laser_plane.tolist(),
+        },
+        "axis": {
+            "head_offset_m": list(calibration.mount.offset_m),
+            "tilt_deg": list(calibration.mount.tilt_deg),
+        },
+    }  # fmt: skip
+    if calibration.ratio:
+        document["ratio"] = {
+            "alpha_deg": calibration.ratio.alpha_deg, "beta_deg": calibration.ratio.beta_deg,
+            "baseline_m": calibration.ratio.baseline_m, "width": calibration.ratio.width,
         }  # fmt: skip
-        if self.ratio:
-            document["ratio"] = {
-                "alpha_deg": self.ratio.alpha_deg, "beta_deg": self.ratio.beta_deg,
-                "baseline_m": self.ratio.baseline_m, "width": self.ratio.width,
-            }  # fmt: skip
-        if self.pixel_angle:
-            document["pixel_angle"] = {
-                "rpc_deg": self.pixel_angle.rpc_deg, "ro_deg": self.pixel_angle.ro_deg,
-                "baseline_m": self.pixel_angle.baseline_m,
-            }  # fmt: skip
-        for name in ("residuals", "covariance", "meta"):
-            if getattr(self, name):
-                document[name] = getattr(self, name)
-        return tomli_w.dumps(_plain(document))
-
-    def save(self, path: Path | str) -> None:
-        """Write the calibration as TOML."""
-        try:
-            Path(path).write_text(self.dumps(), encoding="utf-8")
-        except OSError as error:
-            raise CalibrationError(f"calibration {path} cannot be written: {error}") from error
+    if calibration.pixel_angle:
+        document["pixel_angle"] = {
+            "rpc_deg": calibration.pixel_angle.rpc_deg, "ro_deg": calibration.pixel_angle.ro_deg,
+            "baseline_m": calibration.pixel_angle.baseline_m,
+        }  # fmt: skip
+    for name in ("residuals", "covariance", "meta"):
+        if getattr(calibration, name):
+            document[name] = getattr(calibration, name)
+    return tomli_w.dumps(_plain(document))
 
 
 def _with_tuples(document: dict[str, Any]) -> dict[str, Any]:
