@@ -105,6 +105,8 @@ def parse(text: str, source: str, settings: Iterable[str] = (), folder: Path | N
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source} is not valid TOML: {error}") from error
+    settings = tuple(settings)
+    source += " with the options given" if settings else ""
     calibration = document.get("calibration")
     if isinstance(calibration, str) and folder is not None:
         document["calibration"] = str(folder / calibration)

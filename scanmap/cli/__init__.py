@@ -69,7 +69,6 @@ def _run(words: list[str], debug: bool) -> int:
     try:
         return int(app(words, prog_name="scanmap", standalone_mode=False) or 0)
     except KeyboardInterrupt:
-        terminal.complain("interrupted")
         return 130
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.EPIPE:
@@ -78,7 +77,7 @@ def _run(words: list[str], debug: bool) -> int:
         if debug and not usage:
             raise
         bug = f"{type(error).__name__}: {error}. This is a bug; the same command with --debug shows where"
-        terminal.complain(usage or (str(error) if isinstance(error, ScanmapError) else bug))
+        terminal.complain(usage or (str(error) if isinstance(error, ScanmapError | OSError) else bug))
         return 2 if usage or isinstance(error, ConfigError) else 1
 
 

@@ -53,7 +53,7 @@ def view(
     if session.shown_as_it_is(source):
         if save is not None:
             raise ConfigError(f"--save makes an .rrd of a recording, a folder or a video; {source} is none")
-        session.show(source)
+        session.show_as_it_is(source)
         return
     choice = session.Choice(config, tuple(set_ or ()), calibration)
     with stop_on_signal() as stop, session.prepare_view(source, choice, save) as job:

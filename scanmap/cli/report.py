@@ -79,7 +79,8 @@ def print_summary(summary: Summary) -> None:
         say(f"rows without a point: {reasons}")
     if not summary.budget:
         return
-    table = Table(title="accuracy budget (sigma of a point)", title_justify="left")
+    say("accuracy budget (sigma of a point):")
+    table = Table()
     for name in ("range", "points", "median mm", "95 % mm"):
         table.add_column(name, justify="left" if name == "range" else "right")
     for band in summary.budget:

@@ -99,6 +99,7 @@ class Stop:
 
     def __init__(self) -> None:
         self.asked = False
+        self.at_once = False
         self._words = ""
 
     def orderly(self, words: str) -> Callable[[], bool]:
@@ -109,6 +110,7 @@ class Stop:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Take a signal."""
         if self.asked or not self._words:
+            self.at_once = True
             raise KeyboardInterrupt
         self.asked = True
         say(f"{self._words} (once more to stop at once)")
@@ -121,6 +123,12 @@ def stop_on_signal() -> Iterator[Stop]:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
+    except BaseException as error:
+        if not stop.at_once:
+            raise
+        # Libraries make other errors of it, when it comes while they are loaded.
+        complain("interrupted")
+        raise KeyboardInterrupt from error
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

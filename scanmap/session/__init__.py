@@ -1,7 +1,15 @@
 """Opens what a config names, runs it, writes it, and holds it against the twin's truth; for cli and panel."""
 
 from scanmap.session.description import describe
-from scanmap.session.inspection import map_lines, map_of_cloud, map_settings, prepare_view, shown_as_it_is, watch
+from scanmap.session.inspection import (
+    map_lines,
+    map_of_cloud,
+    map_settings,
+    prepare_view,
+    show_as_it_is,
+    shown_as_it_is,
+    watch,
+)
 from scanmap.session.job import Job, Progress, Result
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
@@ -21,6 +29,7 @@ __all__ = [
     "prepare_scan",
     "prepare_view",
     "show",
+    "show_as_it_is",
     "shown_as_it_is",
     "watch",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -80,7 +81,7 @@ def _describe_toml(path: Path) -> list[str]:
         f"rig {path}: {config.description or 'without a description'}",
         f"rig = {config.rig}; calibration: {head}",
         f"sweep: {plan(config.sweep).words}",
-        f"all of it: scanmap config --config {path}",
+        f"all of it: scanmap config --config {shlex.quote(str(path))}",
     ]
 
 
@@ -106,6 +107,8 @@ def _describe_mesh(path: Path) -> list[str]:
         count = len(mesh.faces)
     except Exception as error:  # trimesh raises whatever its parsers run into
         raise RecordingError(f"mesh {path} cannot be read: {type(error).__name__}: {error}") from error
+    if not len(points):
+        raise RecordingError(f"mesh {path} holds no corner: it is empty or no mesh")
     return [f"mesh {path}: {len(points)} corners, {count} triangles", _extent(points)]
 
 
@@ -130,9 +133,11 @@ def _describe_pcd(path: Path) -> list[str]:
 
 def _describe_xyz(path: Path) -> list[str]:
     try:
-        points = np.loadtxt(path, ndmin=2)[:, :3].reshape(-1, 3)
-    except (ValueError, OSError, IndexError) as error:
-        raise RecordingError(f"{path} is not x y z as text: {error}") from error
+        points = np.array([line.split()[:3] for line in path.read_text(encoding="ascii").splitlines()], np.float64)
+    except ValueError as error:
+        raise RecordingError(f"cloud {path} is not x y z as text: {error}") from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise RecordingError(f"cloud {path} is not x y z as text: it has no line of three numbers")
     return [f"cloud {path}: {len(points)} points", _extent(points)]
 
 
@@ -141,7 +146,7 @@ def _extent(points: NDArray[np.float64]) -> str:
     if not len(known):
         return "extent: none"
     parts = zip("xyz", known.min(axis=0), known.max(axis=0), strict=True)
-    return "extent: " + ", ".join(f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in parts)
+    return "extent: " + ", ".join(f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in parts) + " m"
 
 
 _READERS: dict[str, Callable[[Path], list[str]]] = {

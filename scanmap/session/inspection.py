@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,6 +23,18 @@ SHOWN_AS_THEY_ARE = (".rrd", ".ply", ".glb", ".stl", ".obj")
 def shown_as_it_is(path: Path) -> bool:
     """Whether the viewer opens this file directly: a view, a cloud or a mesh."""
     return path.suffix.lower() in SHOWN_AS_THEY_ARE
+
+
+def show_as_it_is(path: Path) -> None:
+    """Open the viewer on a file that needs no work.
+
+    Raises:
+        ConfigError: no such file, no display, or the viewer does not start.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path} is not a file; make a view with scanmap view SOURCE --save F.rrd")
+    require_display(f"open it where there is one: rerun {shlex.quote(str(path))}")
+    show(path)
 
 
 def prepare_view(source: Path, choice: Choice, save: Path | None) -> Job:

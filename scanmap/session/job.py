@@ -15,6 +15,7 @@ from scanmap.calibration import Calibration
 from scanmap.config import Config
 from scanmap.errors import RecordingError, ScanmapError
 from scanmap.grid import OccupancyGrid
+from scanmap.laserline import Reason
 from scanmap.pipeline import Pipeline, Sink, Step, checked, run
 from scanmap.recording import Recorder
 from scanmap.scan import Scan
@@ -200,7 +201,8 @@ class Job:
         if self.outputs.rrd is not None and self.view.whole:
             files.append(self.outputs.rrd)
         elif self.outputs.rrd is not None:
-            unwritten.append((self.outputs.rrd, "it has no end; is the disk full?"))
+            self.outputs.rrd.unlink(missing_ok=True)  # without its end no viewer opens it
+            unwritten.append((self.outputs.rrd, "it could not be written to its end; is the disk full?"))
 
     def _leave_nothing_empty(self) -> None:
         """Close what is still open; a recording or view without a single shot is not worth a file."""
@@ -214,6 +216,8 @@ class Job:
                 self.recorder.path.unlink(missing_ok=True)
 
     def _pointless(self, summary: Summary) -> str:
+        if set(summary.lost) == {Reason.DAMAGED}:
+            return f"no image of {self.done} can be used, so there is no cloud or map to write; the faults say why"
         reasons = ", ".join(reason.words for reason in summary.lost)
         shots = "the only shot" if self.done == 1 else f"any of {self.done} shots"
         return (
