@@ -324,6 +324,19 @@ def test_a_camera_upside_down_gives_the_same_side():
     assert ((np.cross(b - a, c - a) * -a).sum(axis=-1) > 0).all()
 
 
+def test_a_thing_on_a_turntable_shows_its_front_and_so_does_the_wall_behind():
+    thing = ((-0.10, -0.12, -0.5), (0.13, 0.09, 0.1))
+    scan = box_scan(FULL_TURN, 120, boxes=[thing], mount=HeadMount((-0.6, 0.0, 0.0)))
+    vertices, triangles = mesh(scan)
+    column = np.nonzero(scan.valid)[0]
+    a, b, c = vertices[triangles].astype(float).swapaxes(0, 1)
+    front = (np.cross(b - a, c - a) * (scan.origins[column[triangles[:, 0]]] - a)).sum(axis=-1) > 0
+    on_thing = on_box(scan, thing, 0.005)[scan.valid][triangles].all(axis=1)
+    assert on_thing.sum() > 5000
+    assert (~on_thing).sum() > 5000
+    assert front.all()
+
+
 def test_the_parameters_reach_the_filter():
     scan = box_scan(np.arange(0.0, 60.0, 1.0), 240)
     cells = np.zeros(scan.valid.shape, bool)

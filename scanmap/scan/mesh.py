@@ -75,9 +75,30 @@ def _cell_triangles(q: F32, rows: Mask, bearings: Mask, number: NDArray[np.int32
 
 
 def _facing_head(found: NDArray[np.int32], vertices: F32, scan: Scan) -> NDArray[np.int32]:
-    """The triangles turned round together if most show their back: rows may run up as well as down."""
-    some = found[:: max(1, len(found) // 4096)]
-    a, b, c = (vertices[some[:, k]].astype(np.float64) for k in range(3))
-    column = np.searchsorted(np.cumsum(scan.valid.sum(axis=1)), some[:, 0], side="right")
-    facing = (np.cross(b - a, c - a) * (scan.origins[column] - a)).sum(axis=-1)
-    return found if np.sign(facing).sum() >= 0 else found[:, ::-1]
+    """The triangles turned so that the head sees their front.
+
+    Rows may run up as well as down, so all may need turning; and where the head looks across its own axis, at a
+    turntable, what lies before the axis moves against what lies behind it, so each is asked.
+    """
+    ends = np.cumsum(scan.valid.sum(axis=1))
+    front = _fronts(found[:: max(1, len(found) // 4096)], vertices, ends, scan.origins)
+    if not len(front) or front.mean() > 0.99:
+        return found
+    if front.mean() < 0.01:
+        return found[:, ::-1]
+    for start in range(0, len(found), 65536):
+        part = found[start : start + 65536]
+        back = ~_fronts(part, vertices, ends, scan.origins)
+        part[back] = part[back][:, ::-1]
+    return found
+
+
+def _fronts(found: NDArray[np.int32], vertices: F32, ends: NDArray[np.int64], origins: NDArray[np.float64]) -> Mask:
+    """Whether triangles (N, 3) are counter-clockwise from where their first corner was seen, (N,).
+
+    Noise along the ray, which turns normals, leaves this as it is.
+    """
+    a, b, c = (vertices[found[:, k]].astype(np.float64) for k in range(3))
+    seen_from = origins[np.searchsorted(ends, found[:, 0], side="right")]
+    front: Mask = (np.cross(b - a, c - a) * (seen_from - a)).sum(axis=-1) > 0
+    return front
