@@ -23,7 +23,7 @@ MAX_STEP = np.radians(15.0)
 # Rows (and bearings) without a point that a surface may bridge.
 MAX_GAP = 2
 # Columns of the range image worked on at a time, so that the intermediate arrays stay in the processor's cache.
-BLOCK_CELLS = 40_000
+BLOCK_CELLS = 60_000
 
 
 class Disparity(NamedTuple):

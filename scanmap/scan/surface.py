@@ -5,8 +5,6 @@ The functions want a scan whose bearings ascend (`Scan.merged`); a scan of a ful
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -91,12 +89,12 @@ def normals(scan: Scan, params: ScanParams | None = None) -> F32:
     halo = along + 2
     d = disparity(scan, params, halo)
     down = int(np.clip(round(third / max(d.row_step, 1e-6)), 1, max(1, scan.rows // 3)))
+    # Columns of the halo of a scan that is no full turn are the wrong ones; no link leads there.
     order = np.arange(-halo, len(scan) + halo) % len(scan)
     origins = scan.origins.astype(np.float32)
     for block in blocks(len(scan), scan.rows):
         wide = slice(block.start, block.stop + 2 * halo)
         points = np.ascontiguousarray(np.moveaxis(scan.points[order[wide]], -1, 0))
-        points[:, np.isnan(d.q[wide])] = np.nan
         patch = _patch_normals(points, d, wide, depth_edge_slope(params), along, down)[:, halo:-halo]
         view = origins[block].T[:, :, None] - points[:, halo:-halo]
         patch *= np.copysign(np.float32(1.0), (patch * view).sum(axis=0))
@@ -125,19 +123,21 @@ def _row_means(points: F32, links: NDArray[np.uint8], window: int) -> F32:
     window |= 1
     if window < 3:
         return points
-    size, flat = (window, 1), (-1, points.shape[2])
-    known = np.isfinite(points[0])
-    sums = cv2.boxFilter(
-        np.where(known, points, np.float32(0.0)).reshape(flat),
-        -1,
-        size,
-        normalize=False,
-        borderType=cv2.BORDER_CONSTANT,
-    ).reshape(points.shape)
-    count = cv2.boxFilter(known.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    whole = _shifted(_all_linked(links, window - 1, axis=1), -(window // 2), 1, False) & (count > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(whole, sums / count, points)
+    half, known = window // 2, np.isfinite(points[0])
+    sums = _row_sums(np.where(known, points, np.float32(0.0)).reshape(-1, points.shape[2]), window)
+    count = _row_sums(known.astype(np.float32), window)
+    whole = np.zeros_like(known)
+    whole[:, half:] = _all_linked(links, window - 1, axis=1)[:, :-half]
+    whole &= count > 0
+    means = sums.reshape(points.shape)
+    np.divide(means, count, out=means, where=whole)
+    np.copyto(means, points, where=~whole)
+    return means
+
+
+def _row_sums(values: F32, window: int) -> F32:
+    sums = cv2.boxFilter(values, -1, (window, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(sums, np.float32)
 
 
 def _chord(points: F32, links: NDArray[np.uint8], span: int, axis: int) -> F32:
@@ -145,15 +145,22 @@ def _chord(points: F32, links: NDArray[np.uint8], span: int, axis: int) -> F32:
 
     Each end is `span` cells away where the surface reaches that far, else the next cell, else the cell itself.
     """
-    ends = [points, points]
+    after, before = points.copy(), points.copy()
+    known = np.isfinite(points[0])
     for reach in sorted({1, span}):
-        onward = _all_linked(links, reach, axis)
-        for side, sign in enumerate((1, -1)):
-            there = _shifted(points, sign * reach, axis + 1, np.nan)
-            linked = onward if sign > 0 else _shifted(onward, -reach, axis, False)
-            ends[side] = np.where(linked & np.isfinite(there[0]), there, ends[side])
-    chord: F32 = ends[0] - ends[1]
-    return chord
+        if reach >= known.shape[axis]:
+            break
+        low, high = _part(axis, None, -reach), _part(axis, reach, None)
+        onward = _all_linked(links, reach, axis)[low]
+        np.copyto(after[:, *low], points[:, *high], where=onward & known[high])
+        np.copyto(before[:, *high], points[:, *low], where=onward & known[low])
+    after -= before
+    return after
+
+
+def _part(axis: int, start: int | None, stop: int | None) -> tuple[slice, slice]:
+    """The slice from start to stop along `axis` of a two-dimensional array."""
+    return (slice(start, stop), slice(None)) if axis == 0 else (slice(None), slice(start, stop))
 
 
 def _all_linked(links: NDArray[np.uint8], count: int, axis: int) -> Mask:
@@ -161,15 +168,3 @@ def _all_linked(links: NDArray[np.uint8], count: int, axis: int) -> Mask:
     kernel = np.ones((1, count) if axis == 1 else (count, 1), np.uint8)
     eroded = cv2.erode(links, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return eroded.astype(bool)
-
-
-def _shifted(values: NDArray[Any], offset: int, axis: int, beyond: float | bool) -> NDArray[Any]:
-    """values[i + offset] at i along `axis`, `beyond` past the border."""
-    result = np.full_like(values, beyond)
-    to: list[slice] = [slice(None)] * values.ndim
-    source = to.copy()
-    size = values.shape[axis]
-    to[axis] = slice(max(0, -offset), size - max(0, offset))
-    source[axis] = slice(max(0, offset), size - max(0, -offset))
-    result[tuple(to)] = values[tuple(source)]
-    return result
