@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: scan test test-slow check bench lock dist clean
+.PHONY: scan test test-slow check bench demo lock dist clean
 
 # A fresh machine needs python >= 3.11 with pip and venv, and make; nothing else, no root.
 $(VENV)/.installed: pyproject.toml
@@ -41,3 +41,10 @@ dist: $(VENV)/.installed-dev
 
 clean:
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache
+
+# The recording in recordings/: small enough to live in the repository.
+demo: $(VENV)/.installed
+	rm -f recordings/demo.mcap recordings/demo.rrd
+	$(BIN)/scanmap scan --config twin-quick --record recordings/demo.mcap --rrd recordings/demo.rrd \
+	  --set calibration.image.width=640 --set calibration.image.height=480 --set twin.sensor.jpeg_quality=80 \
+	  --set view.image_width_px=320 --set view.thesis_every=6 --set view.thesis_width_px=320

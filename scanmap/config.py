@@ -127,7 +127,9 @@ def parse(text: str, source: str, settings: Iterable[str] = (), folder: Path | N
 
 
 def _presets() -> Any:
-    return files("scanmap") / "configs"
+    """The folder of presets: inside an installed package, beside it in a checkout."""
+    installed = files("scanmap") / "configs"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "configs"
 
 
 def _read(name: str) -> tuple[str, str, Path | None]:
