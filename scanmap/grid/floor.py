@@ -104,13 +104,20 @@ def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
     origins = np.array([scan.mount.T_world_head(float(b))[:3, 3] for b in scan.bearings[::across]]).reshape(-1, 3)
     rho = np.hypot(*np.moveaxis(points[..., :2] - origins[:, None, :2], -1, 0))
     level = np.zeros(rho.shape, dtype=bool)
-    dz, dr = np.diff(points[..., 2], axis=1), np.abs(np.diff(rho, axis=1))
-    # A short step says nothing about the slope where its ranges are noise.
-    noise = 2.0 * np.maximum(sigma[:, 1:], sigma[:, :-1])
-    flat = (np.abs(dz) < _HORIZONTAL_SLOPE * dr) & (dr > noise)
-    level[:, 1:-1] = flat[:, 1:] & flat[:, :-1]  # on both sides: the foot of a wall is not floor
+    # A short step says nothing about the slope where its ranges are noise: then a longer one is asked.
+    for step in (1, 2, 4, 8):
+        flat = _runs_level(points[..., 2], rho, sigma, step)
+        level[:, step:-step] |= flat[:, step:] & flat[:, :-step]  # on both sides: the foot of a wall is not floor
     some = np.isfinite(points).all(axis=-1)
     return points[some], sigma[some], level[some]
+
+
+def _runs_level(height: Array, rho: Array, sigma: Array, step: int) -> NDArray[np.bool_]:
+    """Whether the surface from each row to the one `step` below is nearly horizontal, (B, rows - step)."""
+    dz = height[:, step:] - height[:, :-step]
+    dr = np.abs(rho[:, step:] - rho[:, :-step])
+    flat: NDArray[np.bool_] = np.abs(dz) < _HORIZONTAL_SLOPE * dr
+    return flat & (dr > 2.0 * np.maximum(sigma[:, step:], sigma[:, :-step]))
 
 
 def _strongest_layer(points: Array, max_tilt: float) -> Array:
