@@ -171,7 +171,7 @@ class Job:
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
         if summary.points:
             grid = OccupancyGrid.from_scan(clean, self.config.grid)
-            files, unwritten = write_results(clean, grid, self.outputs)
+            files, unwritten = write_results(clean, grid, self.outputs, self.config.scan)
         else:
             error = error or RecordingError(self._pointless(summary))
         self._close_view(clean, grid, files, unwritten)

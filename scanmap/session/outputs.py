@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from scanmap.errors import ConfigError, ScanmapError
 from scanmap.grid import OccupancyGrid, save_map
-from scanmap.scan import Scan
+from scanmap.scan import Scan, ScanParams
 from scanmap.scan.formats import check_writable, write
 
 
@@ -86,9 +87,12 @@ class Outputs:
 
 
 def write_results(
-    scan: Scan, grid: OccupancyGrid | None, outputs: Outputs
+    scan: Scan, grid: OccupancyGrid | None, outputs: Outputs, params: ScanParams
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Write clouds and map. One that fails does not cost the others.
+
+    Args:
+        params: what normals and meshes are made by.
 
     Returns:
         Files written, and those that could not be with the reason.
@@ -105,7 +109,7 @@ def write_results(
             failed.append((path, str(error)))
 
     for path in outputs.clouds:
-        attempt(path, lambda path=path: write(scan, path))  # type: ignore[misc]
+        attempt(path, partial(write, scan, path, params))
     if outputs.map is not None and grid is not None:
         map_path = outputs.map
         attempt(map_path, lambda: save_map(grid, map_path, image_format=outputs.map_image, mode=outputs.map_mode))
