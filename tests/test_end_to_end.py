@@ -12,7 +12,7 @@ from conftest import TwinScan
 
 from scanmap import session
 from scanmap.calibration import Calibration, Intrinsics
-from scanmap.geometry import HeadMount, fit_plane, rigid
+from scanmap.geometry import HeadMount, PlaneFit, fit_plane, rigid
 from scanmap.grid import OccupancyGrid
 from scanmap.scan import Scan
 from scanmap.scan.formats import read_ply
@@ -104,27 +104,31 @@ def wall_points(scan: Scan, normal: np.ndarray, d: float) -> np.ndarray:
     return points[np.abs(points @ normal + d) < 0.05]
 
 
+def corner(a: PlaneFit, b: PlaneFit) -> np.ndarray:
+    """Where two upright planes meet, seen from above (2,)."""
+    return np.linalg.solve(np.stack([a.normal[:2], b.normal[:2]]), [-a.d, -b.d])
+
+
 def test_box_has_its_true_area(tmp_path: Path) -> None:
-    scanned = TwinScan(tmp_path, "twin.room=box", "sweep.step_deg=3.0")
+    """Every wall flat and in its place, and the polygon of the fitted walls as large as the room."""
+    once_round = ("stage.max_deg=360", "sweep.end_deg=354", "sweep.step_deg=6.0")
+    scanned = TwinScan(tmp_path, "twin.room=box", *once_round)
     truth = scanned.truth
     assert truth is not None
-    size = scanned.job.config.twin.box_size_m
-    scan = scanned.result.scan
-    lines = []
-    for wall in truth.walls:
-        if abs(wall.normal[2]) > 0.5:
-            continue
-        points = wall_points(scan, wall.normal, wall.d)
-        if len(points) < 200:
-            continue
+    upright = [wall for wall in truth.walls if abs(wall.normal[2]) < 0.5]
+    upright.sort(key=lambda wall: np.arctan2(wall.normal[1], wall.normal[0]))
+    fits = []
+    for wall in upright:
+        points = wall_points(scanned.result.scan, wall.normal, wall.d)
         fit = fit_plane(points)
-        assert fit.rms_m < 0.01
-        lines.append((wall, fit))
-    # The head turns through 180 deg: three walls whole, the fourth behind it.
-    assert len(lines) >= 3
-    for wall, fit in lines:
+        assert len(points) > 1000 and fit.rms_m < 0.006
         assert abs(abs(fit.normal @ wall.normal) - 1.0) < 1e-5
-        assert abs(abs(fit.d) - abs(wall.d)) < 0.003 * size[0]
+        assert abs(abs(fit.d) - abs(wall.d)) < 0.002
+        fits.append(fit)
+    assert len(fits) == 4
+    x, y = np.array([corner(fits[k], fits[(k + 1) % 4]) for k in range(4)]).T
+    area = 0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    assert area == pytest.approx(truth.area_m2, rel=0.003)
 
 
 def head_of_rig_json(path: Path) -> Calibration:
