@@ -3,10 +3,12 @@
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -581,3 +583,27 @@ def test_live_progress_is_a_line_now_and_then_where_no_bar_can_be(capsys: Any, m
             move(session.Progress(done, 100, 9.0, 200, 240))
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["scanning 10/100, 99 s left, bearing 9.00 deg, 200/240 rows"]
+
+
+def test_bar_on_a_terminal_moves_and_ends(small: Path, tmp_path: Path) -> None:
+    pty = pytest.importorskip("pty")
+    leader, follower = pty.openpty()
+    command = [sys.executable, "-c", "from scanmap.cli import main; main()", "replay", str(small), "--out", "a.ply"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80", "LINES": "24"}
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=follower, stderr=subprocess.PIPE)
+    os.close(follower)
+    watch = threading.Timer(60, process.kill)
+    watch.start()
+    shown = b""
+    try:
+        while piece := os.read(leader, 65536):
+            shown += piece
+    except OSError:  # Linux's way of saying that the other end is closed
+        pass
+    _, err = process.communicate(timeout=60)
+    watch.cancel()
+    os.close(leader)
+    assert process.returncode == 0 and not err
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode())
+    assert "7/7 0:00:00 left, bearing 180.00 deg" in text and "wrote a.ply" in text
+    assert max(len(line) for line in re.split(r"[\r\n]+", text)) <= 80

@@ -35,7 +35,8 @@ def progress_bar(work: str, total: int | None) -> Iterator[Callable[[Progress], 
         TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn(),
         TextColumn("left{task.fields[where]}"),
     )  # fmt: skip
-    with Bar(*columns, console=console, expand=True) as bar:
+    # Not stdout: the console writes there itself.
+    with Bar(*columns, console=console, expand=True, redirect_stdout=False) as bar:
         task = bar.add_task(work, total=total, where="")
 
         def move(progress: Progress) -> None:
