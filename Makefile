@@ -31,7 +31,12 @@ check: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/test_architecture.py
 
 bench: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/laserline.py
 	$(BIN)/python benchmarks/pipeline.py
+	$(BIN)/python benchmarks/scan.py
+	$(BIN)/python benchmarks/grid.py
+	$(BIN)/python benchmarks/recording.py
+	$(BIN)/python benchmarks/twin.py
 
 lock:
 	uv lock
