@@ -465,10 +465,10 @@ def test_an_output_that_fails_costs_no_other(run: Run, small: Path, monkeypatch:
 
     real = outputs.write
 
-    def full(scan: Any, path: Path) -> None:
+    def full(scan: Any, path: Path, *more: Any) -> None:
         if path.suffix == ".pcd":
             raise OSError(28, "No space left on device")
-        real(scan, path)
+        real(scan, path, *more)
 
     monkeypatch.setattr(outputs, "write", full)
     said = run("replay", small, "--out", "a.pcd", "--out", "a.ply")
