@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -108,7 +109,9 @@ class Job:
         try:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
             sinks = self._sinks(scan, faults, progress)
-            run(checked(self._recorded(), self.calibration), pipeline.process, sinks, stop)
+            # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
+            with closing(self._recorded()) as shots:
+                run(checked(shots, self.calibration), pipeline.process, sinks, stop)
             if stop():
                 ended = "interrupted"
         except KeyboardInterrupt:
@@ -126,10 +129,15 @@ class Job:
             raise RecordingError("there is no shot to make a scan of")
         return self._finished(scan, faults, ended, error)
 
-    def _recorded(self) -> Iterator[Shot]:
+    def _recorded(self) -> Generator[Shot]:
         """The shots, each in the recording before anything is done with it."""
-        for shot in self.shots():
-            yield self.recorder.write(shot) if self.recorder is not None else shot
+        source = self.shots()
+        try:
+            for shot in source:
+                yield self.recorder.write(shot) if self.recorder is not None else shot
+        finally:
+            if isinstance(source, Generator):
+                source.close()
 
     def _sinks(self, scan: Scan, faults: list[str], progress: Callable[[Progress], None]) -> list[Sink]:
         def collect(step: Step) -> None:
