@@ -38,8 +38,8 @@ _WEIGHTS = {
     "luminance_709": (0.072169, 0.715160, 0.212671),
 }
 _YCRCB = {"ycbcr_y": 0, "ycbcr_cr": 1, "ycbcr_cb": 2}
-# Rows between those that the laser's colour is measured on.
-_COLOUR_ROWS = 16
+# Rows that the laser's colour is measured on.
+_COLOUR_ROWS = 32
 
 
 def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = None) -> U8:
@@ -75,24 +75,26 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
 def laser_channel(image: U8) -> int:
     """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour.
 
-    Measured on every 16th row: how far the best place rises above its sides in one channel more than in the
+    Measured on some rows: how far the best place rises above its sides in one channel more than in the
     others, so that white things, however bright, do not vote; the better half of the rows counts. Where the core
     saturates every channel alike, its flanks still have the laser's colour.
     """
-    rows = image[:: min(_COLOUR_ROWS, max(1, image.shape[0] // 8))].astype(np.float32)
+    rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // _COLOUR_ROWS)])
     core = cv2.blur(rows, (3, 1))
     padded = cv2.copyMakeBorder(core, 0, 0, 12, 12, cv2.BORDER_REPLICATE)
-    height = core - np.maximum(padded[:, :-24], padded[:, 24:])
-    others = np.stack([np.maximum(height[..., (c + 1) % 3], height[..., (c + 2) % 3]) for c in range(3)], axis=-1)
-    excess = height - np.maximum(others, 0.0)
-    best = np.sort(excess.max(axis=1), axis=0)
-    strength = best[len(best) // 2 :].mean(axis=0)
+    height = cv2.split(cv2.subtract(core, cv2.max(padded[:, :-24], padded[:, 24:])))
+    best = [np.sort(cv2.subtract(height[c], cv2.max(height[c - 1], height[c - 2])).max(axis=1)) for c in range(3)]
+    strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
     # A grey picture in three channels has no excess at all: then the brightest line counts.
-    return int(np.argmax(strength if strength.max() > 1.0 else height.max(axis=1).mean(axis=0)))
+    if max(strength) <= 1.0:
+        strength = [float(plane.max(axis=1).mean()) for plane in height]
+    return int(np.argmax(strength))
 
 
 # What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
 PEDESTAL = 16
+SATURATED = 250  # [grey levels] from here on a sample says only "bright"
+_ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
 
 
 def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
@@ -100,7 +102,8 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
 
     The exposure may have changed between the two: the off-plane is first brought to the on-plane's level by
     the gain that matches them where neither saturates, measured on a coarse grid. It is smoothed over 3x3
-    pixels, which takes two thirds of its noise and leaves the things in it.
+    pixels where it is even, which takes two thirds of its noise; where it has edges they must stay what they are.
+    What the off-plane saturates in tells nothing and counts as no light.
 
     Args:
         threshold: differences below it count as none [grey levels].
@@ -109,7 +112,12 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
     usable = (off > 8) & (off < 240) & (on < 240)
     gain = float(np.median(on[usable] / off[usable])) if usable.sum() > 50 else 1.0
     smooth = cv2.blur(background, (3, 3))
-    lit = cv2.addWeighted(plane, 1.0, smooth, -gain, float(PEDESTAL))
+    around = np.ones((3, 3), np.uint8)
+    rough = cv2.subtract(cv2.dilate(background, around), cv2.erode(background, around))
+    _, rough = cv2.threshold(rough, _ROUGH, 255, cv2.THRESH_BINARY)
+    lit = cv2.addWeighted(plane, 1.0, cv2.copyTo(background, rough, smooth), -gain, float(PEDESTAL))
+    _, blind = cv2.threshold(background, SATURATED - 1, 255, cv2.THRESH_BINARY)
+    lit = np.asarray(cv2.subtract(lit, blind), np.uint8)
     if threshold > 0:
         lit[lit < PEDESTAL + threshold] = PEDESTAL
     return np.asarray(lit, np.uint8)

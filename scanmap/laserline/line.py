@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import partial
 from typing import Literal, NamedTuple
 
 import cv2
@@ -10,17 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from scanmap.laserline.candidates import choose_path, colour_doubt, columns_of_rows, find_candidates, noise_of
-from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, laser_channel, to_grey, without_background
-from scanmap.laserline.peaks import SATURATED, Peaks, bright_core, centre_of_gravity, fit_gaussian
+from scanmap.laserline import runs
+from scanmap.laserline.candidates import find_candidates, noise_of
+from scanmap.laserline.colour import blocks_of, colour_doubt, strangers, without_colour
+from scanmap.laserline.cores import bright_core, centre_of_gravity
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, SATURATED, Grey, laser_channel, to_grey, without_background
+from scanmap.laserline.path import by_width, choose_path, columns_of_rows, windows
+from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool
 
 Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
+Index = NDArray[np.intp]
 
-# A run is not the laser line from this share of its height in another channel on.
-_STRANGER = 0.62
+# [px] what the search needs to see beside the window at quarter resolution.
+_MARGIN = 64
+# No sample is known well enough for less.
+_SIGMA_LEAST_PX = 0.003
 # What a core must stand out by where no profile could be fitted: in noise, and in grey levels.
 _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 # A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
@@ -119,119 +127,129 @@ def find_laser_line(
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
     """
-    channel = CHANNEL.get(params.grey) if image.ndim == 3 else None
-    if image.ndim == 3 and params.grey == "auto":
-        channel = laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
-    plane = to_grey(image, params.grey, params.bit_index, channel)
+    if window is None:
+        window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
     if params.method == "brightest":
-        return _brightest(plane, params, window)
+        channel = _channel(image, background, params)
+        return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
+    if not np.isfinite(window).any():
+        return _nothing(len(image), Reason.WINDOW)
+    # Everything below sees only the columns in question.
+    left = max(0, int(np.nanmin(window)) - _MARGIN) // 4 * 4
+    image = image[:, left : int(np.nanmax(window)) + _MARGIN + 1]
+    background = None if background is None else background[:, left : left + image.shape[1]]
+    line = _found(image, params, background, window - left)
+    line.column_px[:] += left
+    return line
+
+
+def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Array) -> LaserLine:
+    if image.ndim == 3 and params.grey in ("auto", *CHANNEL) and without_colour(image):
+        # A monochrome camera's picture in three equal channels.
+        image, background = image[..., 1], background if background is None else background[..., 1]
+    channel = _channel(image, background, params)
+    plane = to_grey(image, params.grey, params.bit_index, channel)
     lit = plane
     if background is not None:
-        lit = without_background(
-            plane, to_grey(background, params.grey, params.bit_index, channel), params.off_threshold
-        )
-    if window is None:
-        window = np.tile([0.0, plane.shape[1] - 1.0], (len(plane), 1))
-    if not np.isfinite(window).any():
-        return _nothing(len(plane), Reason.WINDOW)
+        off = to_grey(background, params.grey, params.bit_index, channel)
+        lit, plane = without_background(plane, off, params.off_threshold), np.asarray(cv2.max(plane, off), np.uint8)
     noise = noise_of(lit)
-    other = None if channel is None or background is not None else extract(image, NEIGHBOUR[channel])
-    candidates = find_candidates(lit, window, noise, other)
+    in_colour = channel is not None and background is None
+    other = blocks_of(image, NEIGHBOUR[channel]) if channel is not None and in_colour else None
+    candidates = find_candidates(lit, window, noise, params.min_snr, other)
     score = candidates.snr
-    if channel is not None and background is None:
+    if channel is not None and in_colour:
         score = score * colour_doubt(image, channel, candidates, noise)
     path = choose_path(candidates, score, params.min_snr)
-    row, column = columns_of_rows(lit, path, window)
+    row, column = columns_of_rows(lit, path, window, noise)
     line = _located(plane, lit, (row, column), noise, params)
     line = _within(line, window)
-    line = _without_blobs(line)
-    if channel is not None and background is None:
-        line = _without_strangers(line, image, channel)
-    line = _without_crumbs(line)
+    line = _lost(line, runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.WIDE)
+    if channel is not None and in_colour:
+        line = _lost(line, strangers(line.column_px, image, channel), Reason.AMBIGUOUS)
+    line = _lost(line, runs.crumbs(line.column_px, line.sigma_px), Reason.AMBIGUOUS)
     if params.pool_rows >= 3:
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
         line = line._replace(column_px=pooled, sigma_px=sigma)
     return line
 
 
-def _located(
-    plane: U8, lit: U8, at: tuple[NDArray[np.intp], NDArray[np.intp]], noise: float, params: LaserLineParams
-) -> LaserLine:
+def _channel(image: U8, background: U8 | None, params: LaserLineParams) -> int | None:
+    """The channel that the line is looked for in; None for a grey image or a conversion that mixes them."""
+    if image.ndim == 2:
+        return None
+    if params.grey == "auto":
+        return laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
+    return CHANNEL.get(params.grey)
+
+
+def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: LaserLineParams) -> LaserLine:
     """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows."""
-    height, width = plane.shape
-    line = _nothing(height, Reason.WEAK)
+    line = _nothing(len(plane), Reason.WEAK)
     row, column = at
     if not row.size:
         return line
-    for wide, some in _by_width(lit, row, column):
+    # Speckle is one for the frame; the largest group tells it best.
+    contrast = {"auto": None, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
+    for half, some in sorted(by_width(lit, row, column), key=lambda group: -len(group[1])):
         if not some.size:
             continue
         r, c = row[some], column[some]
-        x = c[:, None] + np.arange(-wide, wide + 1)
-        outside = (x < 0) | (x >= width)
-        x = np.clip(x, 0, width - 1)
-        y = lit[r[:, None], x].astype(np.float32)
-        saturated = (plane[r[:, None], x] >= SATURATED) | outside
-        peaks = fit_gaussian(y, saturated, noise, params.noise)
-        offset = centre_of_gravity(y) if params.method == "cog" else peaks.offset_px
+        samples = partial(_samples, plane, lit, r, c)
+        y, usable = samples(half)
+        peaks = fit_gaussian(y, usable, noise, contrast, samples)
+        contrast = peaks.contrast
+        offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
         if params.method == "gauss":
             # A wide saturated line whose flanks are no Gaussian's stands in a halo.
             misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
             reason[peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & (reason == Reason.OK)] = Reason.WIDE
-            _take_cores(line, r, c, y, reason, noise)
-        # An edge that cuts the line shows as an odd residual; what it may have moved the column by is added.
-        bias = 0.5 * peaks.width_px * np.maximum(np.abs(peaks.asymmetry) - 0.05, 0.0)
+            final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
+            _take_cores(line, (r, c), y.T, (reason != Reason.OK) & ~final, noise, params)
         good = reason == Reason.OK
         at_good = r[good]
         line.column_px[at_good], line.peak[at_good] = (c + offset)[good], peaks.height[good]
-        line.width_px[at_good], line.sigma_px[at_good] = peaks.width_px[good], np.hypot(peaks.sigma_px, bias)[good]
-        rest = r[~good & (line.reason[r] != Reason.OK)]
+        line.width_px[at_good] = peaks.width_px[good]
+        line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px, peaks.bias_px)[good], _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
-        line.reason[rest] = reason[~good & (line.reason[r] != Reason.OK)]
+        rest = ~good & (line.reason[r] != Reason.OK)
+        line.reason[r[rest]] = reason[rest]
     return line
 
 
+def _samples(seen: U8, lit: U8, row: Index, column: Index, half: int) -> tuple[F32, F32]:
+    """Samples (2 half + 1, N) of the line's light around each column, and 1 where they say more than "bright"."""
+    y = np.ascontiguousarray(windows(lit, row, column, half).T).astype(np.float32)
+    bright = y if lit is seen else windows(seen, row, column, half).T
+    usable = (bright < SATURATED).astype(np.float32)
+    if column.min() < half or column.max() >= lit.shape[1] - half:
+        x = column + np.arange(-half, half + 1)[:, None]
+        usable *= (x >= 0) & (x < lit.shape[1])
+    return y, usable
+
+
 def _take_cores(
-    line: LaserLine, row: NDArray[np.intp], column: NDArray[np.intp], y: F32, reason: NDArray[np.uint8], noise: float
+    line: LaserLine, at: tuple[Index, Index], y: F32, rows: NDArray[np.bool_], noise: float, params: LaserLineParams
 ) -> None:
     """Where the profile is no Gaussian but has a core that stands out sharply, take the core."""
-    at = np.flatnonzero(reason != Reason.OK)
-    if not at.size:
+    if not rows.any():
         return
-    cores = bright_core(y[at])
-    sharp = (cores.contrast > max(_CORE_SNR * noise, _CORE_CONTRAST)) & (np.abs(cores.offset_px) < 3.0)
-    r = row[at[sharp]]
-    line.column_px[r] = column[at[sharp]] + cores.offset_px[sharp]
+    row, column = at[0][rows], at[1][rows]
+    cores = bright_core(y[rows])
+    sharp = (cores.contrast > max(_CORE_SNR * noise, _CORE_CONTRAST, params.min_peak)) & (np.abs(cores.offset_px) < 3.0)
+    sharp &= cores.width_px <= params.max_width_px
+    r = row[sharp]
+    line.column_px[r] = column[sharp] + cores.offset_px[sharp]
     line.peak[r], line.width_px[r] = cores.contrast[sharp], cores.width_px[sharp]
     line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
-
-
-def _by_width(lit: U8, row: NDArray[np.intp], column: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
-    """Rows sorted by how wide their line roughly is: (half width of the fit's window, indices)."""
-    reach = 24
-    x = np.clip(column[:, None] + np.arange(-reach, reach + 1), 0, lit.shape[1] - 1)
-    y = lit[row[:, None], x]
-    top = y[:, reach - 1 : reach + 2].mean(axis=1)
-    # The brighter side counts: beside an edge of the room the run would never end at the darker one's level.
-    sides = np.maximum(y[:, 4:12].mean(axis=1), y[:, -12:-4].mean(axis=1))
-    above = y > (0.5 * (np.minimum(sides, top - 2.0) + top))[:, None]
-    # Width of the run above half height that holds the middle.
-    left = (~above[:, reach::-1]).argmax(axis=1)
-    right = (~above[:, reach:]).argmax(axis=1)
-    full = np.where(above.all(axis=1), 2 * reach, np.maximum(left + right - 1, 0))
-    limits = ((8, 6), (13, 11), (24, 200))  # half window, largest full width at half height
-    found, lower = [], -1
-    for half, upper in limits:
-        found.append((half, np.flatnonzero((full > lower) & (full <= upper))))
-        lower = upper
-    return found
 
 
 def _judged(peaks: Peaks, noise: float, params: LaserLineParams) -> NDArray[np.uint8]:
     """Reason (N,) of each fit."""
     reason = np.full(len(peaks.height), Reason.OK, np.uint8)
     snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / max(noise, 1.0)
+    reason[peaks.one_sided] = Reason.EDGE
     reason[np.abs(peaks.offset_px) > 3.0 + 0.7 * peaks.width_px] = Reason.AMBIGUOUS
     reason[peaks.sigma_px > 1.5] = Reason.WEAK
     # A dim bump whose samples scatter far more than the sensor's do is texture of the room.
@@ -251,58 +269,6 @@ def _within(line: LaserLine, window: Array) -> LaserLine:
     return _lost(line, outside, Reason.WINDOW)
 
 
-def _without_blobs(line: LaserLine) -> LaserLine:
-    """Give up rows far wider across the line than the sharpest good part of it, unless near and therefore bright.
-
-    One beam has one width, which grows toward near things as the light does; what is wide and dim is a thing in
-    the room. The width across a slanted line is its width in the row times the cosine of the slant.
-    """
-    strong = np.isfinite(line.column_px) & (line.peak > 10.0 * line.sigma_px)
-    if strong.sum() < 20:
-        return line
-    slope = np.gradient(np.nan_to_num(line.column_px, nan=-1e4))
-    across = line.width_px / np.sqrt(1.0 + np.clip(slope, -4.0, 4.0) ** 2)
-    sharp = np.percentile(across[strong], 40)
-    with np.errstate(invalid="ignore"):
-        blob = (across > 2.2 * sharp + 0.5) & (line.peak < 140.0)
-        blob |= (across > 1.5 * sharp + 0.3) & (line.peak < 0.25 * np.median(line.peak[strong]))
-    return _lost(line, blob, Reason.WIDE)
-
-
-def _without_strangers(line: LaserLine, image: U8, channel: int) -> LaserLine:
-    """Give up runs of rows that stand out in another channel nearly as much as in the laser's own.
-
-    Over a whole run the shares of the channels are known far better than in a row. Runs whose core saturates are left
-    alone, and so is all of a picture without colour.
-    """
-    row = np.flatnonzero(np.isfinite(line.column_px))
-    if not row.size or np.abs(np.diff(image[::16, ::16].astype(np.int16), axis=2)).mean() < 1.0:
-        return line
-    run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(line.column_px[row])) > 3.0))])
-    middle = np.rint(line.column_px[row]).astype(np.intp)
-    x = np.clip(middle[:, None] + np.array([-2, -1, 0, 1, 2, -9, -8, 8, 9]), 0, image.shape[1] - 1)
-    samples = image[row[:, None], x].astype(np.float32)
-    height = samples[:, :5].mean(axis=1) - samples[:, 5:].mean(axis=1)
-    by_run = np.stack([np.bincount(run, height[:, c]) for c in range(3)], axis=-1)
-    clipped = np.bincount(run, (samples[:, :5, channel].max(axis=1) >= SATURATED - 10).astype(np.float64))
-    other = np.delete(by_run, channel, axis=1).max(axis=1)
-    stranger = (other > _STRANGER * by_run[:, channel]) & (clipped < 0.3 * np.bincount(run))
-    lost = np.zeros(len(line.column_px), bool)
-    lost[row[stranger[run]]] = True
-    return _lost(line, lost, Reason.AMBIGUOUS)
-
-
-def _without_crumbs(line: LaserLine) -> LaserLine:
-    """Give up short runs of rows that no neighbour on either side continues: 3 rows always, 10 rows if weak."""
-    column = line.column_px
-    linked = np.abs(np.diff(column)) < 3.0
-    number = np.concatenate([[0], np.cumsum(~linked)])
-    rows = np.bincount(number)
-    weak = np.bincount(number, np.nan_to_num(line.sigma_px, nan=0.0)) > 0.2 * rows
-    lonely = np.isfinite(column) & ((rows < 4) | (weak & (rows < 12)))[number]
-    return _lost(line, lonely, Reason.AMBIGUOUS)
-
-
 def _lost(line: LaserLine, mask: NDArray[np.bool_], reason: Reason) -> LaserLine:
     line.reason[mask] = reason
     for values in line[:4]:
@@ -310,7 +276,7 @@ def _lost(line: LaserLine, mask: NDArray[np.bool_], reason: Reason) -> LaserLine
     return line
 
 
-def _brightest(plane: U8, params: LaserLineParams, window: Array | None) -> LaserLine:
+def _brightest(plane: U8, params: LaserLineParams, window: Array) -> LaserLine:
     """T5 of the thesis: value and column of the first maximum of each row, whatever it is."""
     column = plane.argmax(axis=1)
     value = plane[np.arange(len(plane)), column].astype(np.float64)
@@ -319,7 +285,7 @@ def _brightest(plane: U8, params: LaserLineParams, window: Array | None) -> Lase
     sigma = np.full(len(plane), np.sqrt(1.0 / 12.0))
     line = LaserLine(column.astype(np.float64), value, np.full(len(plane), np.nan), sigma, reason)
     line = _lost(line, reason == Reason.WEAK, Reason.WEAK)
-    return line if window is None else _within(line, window)
+    return _within(line, window)
 
 
 def _nothing(height: int, reason: Reason) -> LaserLine:

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from scanmap.laserline.grey import SATURATED
 
-SATURATED = 250  # [grey levels] from here on a sample says only "bright"
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
 SIGMA_MIN_PX, SIGMA_MAX_PX = 0.3, 14.0
 _REACH = 3.2  # [sigma] samples farther from the line say nothing of it
 _ITERATIONS = 2
+_SPECKLE_REACH = 5.0  # [sigma] under speckle the flanks say more than the core
+_SPECKLE_ROWS = 31  # rows over which the line's height is smoothed for a first model of its speckle
+_CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
+_CURVED = 5.0  # how much, measured on dim lines: of (sigma_px / width_px)^2
+_FLANK_SHARE = 0.1  # of what the better flank says of u, at least from the other
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
-_CORE_SHARE = 0.35  # of the height that a core is taken from
-_SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
+SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
 
 
 class Peaks(NamedTuple):
@@ -26,110 +34,83 @@ class Peaks(NamedTuple):
     width_px: F32  # standard deviation of the profile
     height: F32  # above the background [grey levels]
     noise: F32  # standard deviation of a sample [grey levels]
-    asymmetry: F32  # odd part of the residual as a fraction of the height
+    bias_px: F32  # what an odd residual, larger than noise explains, may have moved offset_px by
+    contrast: float  # of the speckle, of all rows
     clipped: NDArray[np.bool_]  # the core is saturated
+    one_sided: NDArray[np.bool_]  # nothing usable on one of the two flanks
 
 
-def fit_gaussian(y: F32, saturated: NDArray[np.bool_], sample_noise: float, noise: str = "auto") -> Peaks:
-    """Fit b + A exp(-(x - u)^2 / 2 s^2) to each row of windows.
+def fit_gaussian(
+    y: F32,
+    usable: F32,
+    sample_noise: float,
+    contrast: float | None = None,
+    samples: Callable[[int], tuple[F32, F32]] | None = None,
+) -> Peaks:
+    """Fit b + A exp(-(x - u)^2 / 2 s^2) to each row's window.
 
     Args:
-        y: (N, n) grey levels around each row's peak, n odd.
-        saturated: (N, n) samples that say only "bright", or lie outside the image.
+        y: (n, N) grey levels around each row's peak, n odd; one row of the image per column.
+        usable: (n, N) 1, or 0 for samples that say only "bright" or lie outside the image.
         sample_noise: rough standard deviation of a sample [grey levels].
-        noise: `additive`, `speckle`, or `auto`, which judges from the residuals.
+        contrast: of the speckle; None: judged from the residuals.
+        samples: gives y and usable for another half width of the window.
 
     Gauss-Newton on four parameters, saturated samples left out: the maximum-likelihood estimate for additive
     Gaussian noise, whose bound for u is 2 s_n^2 s / (sqrt(pi) A^2) (Cramer-Rao; Hagen and others 2007). Under
     speckle the samples are weighted by the variance of the model, s_n^2 + C^2 (model - b)^2.
     """
-    n = y.shape[1]
-    x = np.arange(n, dtype=np.float32) - n // 2
-    usable = (~saturated).astype(np.float32)
-    clipped = np.asarray(saturated[:, n // 2 - 1 : n // 2 + 2].any(axis=1))
+    n = len(y)
+    x = (np.arange(n, dtype=np.float32) - n // 2)[:, None]
+    clipped = np.asarray(~usable[n // 2 - 1 : n // 2 + 2].all(axis=0))
     y = _levelled(y, x, sample_noise)
-    u, s, A, b = _start(y, x)
-    weight = usable
-    information = np.zeros(len(y), np.float32)
+    fit = _start(y, x)
     for _ in range(_ITERATIONS):
-        near = np.abs(x - u[:, None]) <= np.maximum(_REACH * s, 3.0)[:, None] + 0.5
-        weight = usable * near
-        u, s, A, b, information = _improve(y, x, weight, u, s)
-    model = b[:, None] + A[:, None] * _bell(x, u, s)
-    contrast = _contrast(y - model, model - b[:, None], weight) if noise != "additive" else 0.0
-    if noise == "speckle" or contrast > _SPECKLE_FROM:
-        variance = _noise_variance(y - model, weight * (model - b[:, None] < 0.2 * A[:, None]))
-        for _ in range(_ITERATIONS + 1):
-            signal = A[:, None] * _bell(x, u, s)
-            speckle = variance[:, None] + (max(contrast, 0.05) * signal) ** 2
-            near = np.abs(x - u[:, None]) <= (_REACH * s)[:, None] + 0.5
-            weight = usable * near * (variance[:, None] / speckle).astype(np.float32)
-            u, s, A, b, information = _improve(y, x, weight, u, s)
-        model = b[:, None] + A[:, None] * _bell(x, u, s)
+        fit = _improve(y, x, usable * _near(x, fit, _REACH), fit)
+    weight = usable * _near(x, fit, _REACH)
+    bell = _bell(x, fit)
+    residual = y - fit.b - fit.A * bell
+    if contrast is None:
+        contrast = _contrast(residual, fit.A * bell, weight, sample_noise)
+    if contrast > SPECKLE_FROM:
+        if samples is not None:
+            y, usable = samples(n // 2 + n // 4)
+            x = (np.arange(len(y), dtype=np.float32) - len(y) // 2)[:, None]
+            y = _levelled(y, x, sample_noise)
+        fit, weight = _fit_speckle(y, x, usable, fit, sample_noise, contrast)
+        bell = _bell(x, fit)
+        residual = y - fit.b - fit.A * bell
     # Of a saturated core the fit's height is a guess; that it rises to saturation is known.
-    A = np.where(clipped, np.maximum(A, SATURATED - b), A)
-    residual = y - model
-    sample_variance = _noise_variance(residual, weight)
-    spread = np.sqrt(sample_variance / np.maximum(information, 1e-6)) * s / A
-    z = (x - u[:, None]) / s[:, None]
-    odd = _bell(x, u, s) * z * (z * z - 1.5)  # orthogonal to the derivative by u over the whole line
-    asymmetry = _dot(weight * odd, residual) / np.maximum(_dot(weight * odd, odd), 1e-6) / A
-    return Peaks(
-        u,
-        spread.astype(np.float32),
-        s,
-        A,
-        np.sqrt(sample_variance).astype(np.float32),
-        asymmetry.astype(np.float32),
-        clipped,
-    )
+    A = np.where(clipped, np.maximum(fit.A, SATURATED - fit.b), fit.A)
+    variance = _noise_variance(residual, weight)
+    # Cramer-Rao with the other three parameters unknown.
+    sigma = np.sqrt(variance / np.maximum(fit.information, 1e-6)) * fit.s / fit.A
+    # A and s are estimates too: what scatters them makes the bound itself too small by their variance.
+    sigma *= 1.0 + _CURVED * np.minimum(sigma / fit.s, 0.4) ** 2
+    z = (x - fit.u) / fit.s
+    slope = weight * bell * z
+    odd = slope * (z * z - np.float32(1.5))  # orthogonal to the derivative by u over the whole line
+    power = np.maximum(_dot(odd, odd), 1e-6)
+    asymmetry, uncertain = np.abs(_dot(odd, residual)) / power / A, np.sqrt(variance / power) / A
+    bias = 0.5 * fit.s * np.maximum(asymmetry - 0.05 - 2.5 * uncertain, 0.0)
+    one_sided = np.zeros(len(fit.u), bool)
+    cut = np.flatnonzero(~usable.all(axis=0))
+    if cut.size:
+        # What each flank adds to the knowledge of u.
+        left, right = -np.minimum(slope[:, cut], 0.0).sum(axis=0), np.maximum(slope[:, cut], 0.0).sum(axis=0)
+        one_sided[cut] = np.minimum(left, right) < _FLANK_SHARE * np.maximum(left, right)
+    sigma, A, bias = (values.astype(np.float32) for values in (sigma, A, bias))
+    return Peaks(fit.u, sigma, fit.s, A, np.sqrt(variance), bias, contrast, clipped, one_sided)
 
 
-class Cores(NamedTuple):
-    """The bright cores of N rows whose profile is no Gaussian, arrays (N,)."""
+class _Fit(NamedTuple):
+    """A line per row, arrays (N,)."""
 
-    offset_px: F32  # from the middle of the window
-    sigma_px: F32
-    width_px: F32  # standard deviation a uniform core of this width has
-    contrast: F32  # height over the brighter of its two sides [grey levels]
-
-
-def bright_core(y: F32) -> Cores:
-    """Middle of the core of each row (N, n), whatever surrounds it.
-
-    For lines of one or two pixels that a camera has sharpened, and for saturated lines in the halo of wax, skin or
-    paint: there the core says where the light fell, the rest where it went. Centre of gravity of the run around the
-    peak that rises above the brighter side 6 to 8 px away and above most of the height.
-    """
-    half = y.shape[1] // 2
-    rows = np.arange(len(y))
-    x = np.arange(y.shape[1], dtype=np.float32) - half
-    top = y[:, half - 4 : half + 5].max(axis=1)
-    peak = half - 4 + y[:, half - 4 : half + 5].argmax(axis=1)
-    left, right = y[:, half - 8 : half - 5].mean(axis=1), y[:, half + 6 : half + 9].mean(axis=1)
-    side = np.maximum(left, right)
-    level = np.maximum(np.minimum(side, top - 4.0), top - _CORE_SHARE * (top - np.minimum(left, right)))
-    w = np.maximum(y - level[:, None], 0.0)
-    # Only the run that holds the peak: cut at the first sample below the level on either side.
-    gap = np.cumsum(w == 0.0, axis=1)
-    w *= gap == gap[rows, peak][:, None]
-    total = np.maximum(w.sum(axis=1), 1e-3)
-    offset = w @ x / total
-    width = np.sqrt(np.maximum(w @ (x * x) / total - offset**2, 0.0) + 1.0 / 12.0)
-    sigma = np.maximum(0.12, 0.3 * width)
-    return Cores(offset.astype(np.float32), sigma.astype(np.float32), width.astype(np.float32), top - side)
-
-
-def centre_of_gravity(y: F32, height_share: float = 0.2) -> F32:
-    """Offset (N,) of the centre of gravity of what rises above a fifth of each row's peak; windows (N, n)."""
-    n = y.shape[1]
-    floor = np.minimum(y[:, :2].mean(axis=1), y[:, -2:].mean(axis=1))
-    top = y.max(axis=1)
-    level = floor + height_share * (top - floor)
-    w = np.maximum(y - level[:, None], 0.0)
-    x = np.arange(n, dtype=np.float32) - n // 2
-    offset: F32 = (w @ x / np.maximum(w.sum(axis=1), 1e-6)).astype(np.float32)
-    return offset
+    u: F32
+    s: F32
+    A: F32
+    b: F32
+    information: F32  # on u, in units of (A / s)^2 / noise^2
 
 
 def _levelled(y: F32, x: F32, sample_noise: float) -> F32:
@@ -139,53 +120,101 @@ def _levelled(y: F32, x: F32, sample_noise: float) -> F32:
     parameter would cost a fifth of the accuracy.
     """
     k = max(2, len(x) // 6)
-    left, right = y[:, :k].mean(axis=1), y[:, -k:].mean(axis=1)
+    left, right = y[:k].mean(axis=0), y[-k:].mean(axis=0)
     ramp = right - left
-    height = y.max(axis=1) - np.maximum(left, right)
+    height = y.max(axis=0) - np.maximum(left, right)
     ramp[np.abs(ramp) < np.maximum(4.5 * sample_noise * np.sqrt(2.0 / k), 0.3 * height)] = 0.0
     if not ramp.any():
         return y
-    levelled: F32 = y - ramp[:, None] * (x / (len(x) - k))[None, :].astype(np.float32)
+    levelled: F32 = y - ramp * (x / np.float32(len(x) - k))
     return levelled
 
 
-def _start(y: F32, x: F32) -> tuple[F32, F32, F32, F32]:
+def _start(y: F32, x: F32) -> _Fit:
     """First guess: background from the window's ends, width from area over height."""
     k = max(2, len(x) // 6)
-    b = np.minimum(y[:, :k].mean(axis=1), y[:, -k:].mean(axis=1))
-    above = np.maximum(y - b[:, None], 0.0)
-    A = np.maximum(above.max(axis=1), 1.0)
-    above *= above > 0.25 * A[:, None]
-    area = above.sum(axis=1)
-    u = np.clip(above @ x / np.maximum(area, 1.0), -2.0, 2.0)
-    s = np.clip(area / A / 2.35, 0.7, 0.3 * len(x))
-    return u.astype(np.float32), s.astype(np.float32), A, b
+    b = np.minimum(y[:k].mean(axis=0), y[-k:].mean(axis=0))
+    above = y - b
+    A = np.maximum(above.max(axis=0), 1.0)
+    above *= above > 0.25 * A
+    area = above.sum(axis=0)
+    u = np.clip(_dot(above, np.broadcast_to(x, y.shape)) / np.maximum(area, 1.0), -2.0, 2.0)
+    s = np.clip(area / A / np.float32(2.35), 0.7, 0.3 * len(x))
+    return _Fit(u.astype(np.float32), s.astype(np.float32), A, b, np.zeros_like(b))
 
 
-def _improve(y: F32, x: F32, weight: F32, u: F32, s: F32) -> tuple[F32, F32, F32, F32, F32]:
-    """One Gauss-Newton step; the last array is the information on u, in units of (A / s)^2 / noise^2."""
-    z = (x - u[:, None]) / s[:, None]
-    g = np.exp(-0.5 * z * z)
+def _improve(y: F32, x: F32, weight: F32, fit: _Fit) -> _Fit:
+    """One Gauss-Newton step."""
+    z = (x - fit.u) / fit.s
+    g = np.exp(np.float32(-0.5) * z * z)
     d = g * z  # derivative by u, times s / A
     q = d * z  # derivative by s, times s / A
-    basis = np.stack([np.ones_like(g), g, d, q])  # (4, N, n)
-    weighted = basis * weight
-    normal = np.einsum("anx,bnx->nab", weighted, basis, optimize=False).astype(np.float64)
-    right = np.einsum("anx,nx->na", weighted, y, optimize=False).astype(np.float64)
-    normal[:, range(4), range(4)] *= 1.0 + 1e-6
-    normal[:, range(4), range(4)] += 1e-6
-    b, A, p, t = np.linalg.solve(normal, right[:, :, None])[:, :, 0].T
+    wg, wd, wq = weight * g, weight * d, weight * q
+    # Normal equations of (b, A, s, u); g q = d d, so that only thirteen sums differ.
+    dd = _dot(wd, d)
+    normal = (
+        (weight.sum(axis=0), wg.sum(axis=0), wq.sum(axis=0), wd.sum(axis=0)),
+        (_dot(wg, g), dd, _dot(wg, d)),
+        (_dot(wq, q), _dot(wq, d)),
+        (dd,),
+    )
+    right = (_dot(weight, y), _dot(wg, y), _dot(wq, y), _dot(wd, y))
+    (b, A, t, p), information = _solved(normal, right)
     A = np.maximum(A, 0.5)
-    u = u + np.clip(p / A, -1.0, 1.0) * s
-    s = np.clip(s * (1.0 + np.clip(t / A, -0.4, 0.6)), SIGMA_MIN_PX, SIGMA_MAX_PX)
     half = len(x) // 2
-    u = np.clip(u, -half, half)
-    return u.astype(np.float32), s.astype(np.float32), A.astype(np.float32), b.astype(np.float32), normal[:, 2, 2]
+    u = np.clip(fit.u + np.clip(p / A, -1.0, 1.0) * fit.s, -half, half)
+    s = np.clip(fit.s * (1.0 + np.clip(t / A, -0.4, 0.6)), SIGMA_MIN_PX, SIGMA_MAX_PX)
+    return _Fit(*(values.astype(np.float32) for values in (u, s, A, b, information)))
 
 
-def _bell(x: F32, u: F32, s: F32) -> F32:
-    z = (x - u[:, None]) / s[:, None]
-    bell: F32 = np.exp(-0.5 * z * z)
+def _solved(normal: Sequence[Sequence[F32]], right: Sequence[F32]) -> tuple[list[F64], F64]:
+    """Solutions (N,) of N symmetric systems, upper triangles given, by Cholesky; and 1 / inverse[-1, -1] of each."""
+    n = len(right)
+    lower: list[list[F64]] = [[] for _ in range(n)]
+    forward: list[F64] = []
+    for i in range(n):
+        for j in range(i + 1):
+            value = normal[j][i - j].astype(np.float64)
+            if i == j:
+                value = value * (1.0 + 1e-6) + 1e-6
+            for k in range(j):
+                value = value - lower[i][k] * lower[j][k]
+            lower[i].append(np.sqrt(np.maximum(value, 1e-9)) if i == j else value / lower[j][j])
+        rest = right[i].astype(np.float64)
+        for k in range(i):
+            rest = rest - lower[i][k] * forward[k]
+        forward.append(rest / lower[i][i])
+    solution: list[F64] = forward.copy()
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            solution[i] = solution[i] - lower[k][i] * solution[k]
+        solution[i] = solution[i] / lower[i][i]
+    return solution, lower[-1][-1] ** 2
+
+
+def _fit_speckle(y: F32, x: F32, usable: F32, fit: _Fit, sample_noise: float, contrast: float) -> tuple[_Fit, F32]:
+    """The fit again, its samples weighted by the model's own variance; and the weights (n, N)."""
+    floor = np.float32(max(sample_noise, 0.5) ** 2)
+    # A row's own fit takes a part of its speckle for signal; the first weights are those of its neighbourhood.
+    smooth = cv2.blur(fit.A[None], (_SPECKLE_ROWS, 1), borderType=cv2.BORDER_REPLICATE)[0]
+    model = fit._replace(s=np.full_like(fit.s, np.median(fit.s)), A=np.asarray(smooth, np.float32))
+    weight = usable
+    for _ in range(_ITERATIONS):
+        variance = floor + np.square(np.float32(contrast) * model.A * _bell(x, model))
+        weight = usable * _near(x, model, _SPECKLE_REACH) * (floor / variance)
+        model = _improve(y, x, weight, model)
+    return model, weight
+
+
+def _near(x: F32, fit: _Fit, reach: float) -> F32:
+    """1 for samples that say something of the line, else 0."""
+    near: F32 = (np.abs(x - fit.u) <= np.maximum(reach * fit.s, 3.0) + np.float32(0.5)).astype(np.float32)
+    return near
+
+
+def _bell(x: F32, fit: _Fit) -> F32:
+    z = (x - fit.u) / fit.s
+    bell: F32 = np.exp(np.float32(-0.5) * z * z)
     return bell
 
 
@@ -194,7 +223,7 @@ def _noise_variance(residual: F32, weight: F32) -> F32:
 
     A row far worse than its neighbours (an edge, a second line) keeps its own.
     """
-    freedom = np.maximum(weight.sum(axis=1) - 4.0, 1.0)
+    freedom = np.maximum((weight > 0).sum(axis=0) - 4.0, 1.0)
     own = _dot(weight * residual, residual) / freedom
     count = -(-len(own) // _ROWS_POOLED)
     filled = np.empty(count * _ROWS_POOLED, np.float32)
@@ -205,24 +234,31 @@ def _noise_variance(residual: F32, weight: F32) -> F32:
     k = float(np.median(freedom)) if len(own) else 1.0
     common = np.repeat(pooled, _ROWS_POOLED)[: len(own)] / (1.0 - 2.0 / (9.0 * k)) ** 3
     limit = 1.0 + 4.0 * np.sqrt(2.0 / freedom)
-    variance: F32 = np.maximum(np.where(own > limit * common, own, common), 1.0 / 12.0)
+    variance: F32 = np.maximum(np.where(own > limit * common, own, common), 1.0 / 12.0).astype(np.float32)
     return variance
 
 
-def _contrast(residual: F32, signal: F32, weight: F32) -> float:
-    """Speckle contrast: how much the residual grows with the signal."""
-    height = signal.max(axis=1, keepdims=True)
-    core = weight * (signal > 0.5 * height)
-    flank = weight * (signal < 0.1 * height)
-    if core.sum() < 100 or flank.sum() < 100:
+def _contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> float:
+    """Speckle contrast: how much the scatter between neighbouring rows grows with the signal.
+
+    Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
+    """
+    stride = max(1, residual.shape[1] // 400)
+    pairs = [(values[:, 1::stride], values[:, :-1:stride]) for values in (residual, signal, weight)]
+    step = pairs[0][0] - pairs[0][1]
+    level = np.minimum(*pairs[1])
+    core = (level > 0.4 * level.max(axis=0, initial=0.0)) * (pairs[2][0] * pairs[2][1])
+    count = core.sum(axis=0)
+    usable = count >= 2
+    if usable.sum() < 20:
         return 0.0
-    # Four parameters were fitted to about as many samples of the core: it keeps a fraction of its variance.
-    kept = 0.5
-    excess = (core * residual**2).sum() / core.sum() / kept - (flank * residual**2).sum() / flank.sum() / 0.9
-    power = (core * signal**2).sum() / core.sum()
-    return float(np.sqrt(max(excess, 0.0) / max(power, 1e-6)))
+    scatter = 0.5 * _dot(core * step, step)[usable] / count[usable]
+    power = _dot(core * level, level)[usable] / count[usable]
+    # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
+    excess = (scatter / _CORE_KEEPS - 1.5 * sample_noise**2) / power
+    return float(np.sqrt(max(float(np.median(excess)) / 0.8, 0.0)))
 
 
 def _dot(a: F32, b: F32) -> F32:
-    product: F32 = np.einsum("ij,ij->i", a, b)
+    product: F32 = np.einsum("ij,ij->j", a, b)
     return product

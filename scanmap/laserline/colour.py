@@ -1,0 +1,137 @@
+"""The laser's colour, measured from the picture, and what in it is not of that colour."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
+from scanmap.laserline.path import CONNECTED_PX
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+_COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
+# A run is not the laser line from this share of its height in another channel on.
+_STRANGER = 0.62
+_HALF = 9  # [px] samples on either side of a line that its colour is measured from
+_TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
+_CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
+
+
+def blocks_of(image: U8, channel: int) -> U8:
+    """Mean (B, W) of the two middle rows of each block of one channel of a BGR image (H, W, 3)."""
+    blocks = -(-len(image) // BLOCK)
+    first, second = (
+        np.asarray(cv2.extractChannel(image[min(k, len(image) - 1) :: BLOCK], channel), np.uint8) for k in (1, 2)
+    )
+    first, second = (
+        rows if len(rows) == blocks else np.concatenate([rows, np.asarray(cv2.extractChannel(image[-1:], channel))])
+        for rows in (first, second)
+    )
+    return np.asarray(cv2.addWeighted(first, 0.5, second, 0.5, 0.0), np.uint8)
+
+
+def without_colour(image: U8) -> bool:
+    """Whether the three channels of a picture (H, W, 3) are one."""
+    coarse = image[::32, ::16].astype(np.int16)
+    return bool(np.abs(np.diff(coarse, axis=2)).mean() < 1.0)
+
+
+def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) -> F32:
+    """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, down to 0 for another.
+
+    Args:
+        image: (H, W, 3).
+        channel: the laser's own.
+        noise: standard deviation of a sample [grey levels].
+
+    The laser's colour is measured from candidates that continue each other over several blocks, as the height of
+    the line in the other channels over its height in its own: the light is of one colour, so whatever it falls on,
+    that share stays, and nothing that hangs together is purer. A candidate is in doubt when another channel
+    rises above it by more than noise explains. Where its own channel is saturated, colour says nothing.
+    """
+    doubt = np.ones_like(candidates.snr)
+    block, which = np.nonzero(candidates.snr > 3.0)
+    if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
+        return doubt
+    height, brightest = _heights(image, block, candidates.column[block, which])
+    own = np.maximum(height[:, channel], 1.0)
+    other = np.delete(height, channel, axis=1).max(axis=1)
+    saturated = brightest[:, channel] >= COLOURLESS
+    share = np.full(candidates.snr.shape, np.nan, np.float32)
+    share[block, which] = np.where(saturated, np.nan, other / own)
+    laser = _laser_share(candidates, share)
+    if laser is None or laser > _COLOURLESS_SHARE:
+        return doubt
+    # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
+    excess = other - (max(laser, 0.0) + 0.4) * own
+    uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
+    factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * own), 0.0, 1.0)
+    doubt[block, which] = np.where(saturated, 1.0, factor)
+    return doubt
+
+
+def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
+    """Rows (H,) in runs that stand out in another channel nearly as much as in the laser's own.
+
+    Over a whole run the shares of the channels are known far better than in a row. Runs whose core saturates are left
+    alone.
+    """
+    lost = np.zeros(len(column), bool)
+    row = np.flatnonzero(np.isfinite(column))
+    if not row.size:
+        return lost
+    run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(column[row])) > 3.0))])
+    middle = np.rint(column[row]).astype(np.intp)
+    x = np.clip(middle[:, None] + np.array([-2, -1, 0, 1, 2, -9, -8, 8, 9]), 0, image.shape[1] - 1)
+    samples = image[row[:, None], x]
+    core, side = samples[:, :5].sum(axis=1, dtype=np.uint16), samples[:, 5:].sum(axis=1, dtype=np.uint16)
+    height = core / 5.0 - side / 4.0
+    by_run = np.stack([np.bincount(run, height[:, c]) for c in range(3)], axis=-1)
+    clipped = np.bincount(run, (samples[:, :5, channel].max(axis=1) >= COLOURLESS).astype(np.float64))
+    other = np.delete(by_run, channel, axis=1).max(axis=1)
+    stranger = (other > _STRANGER * by_run[:, channel]) & (clipped < 0.3 * np.bincount(run))
+    lost[row[stranger[run]]] = True
+    return lost
+
+
+def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
+    """Heights (N, 3) of candidates above their sides by channel, and their brightest samples (N, 3)."""
+    height, width = image.shape[:2]
+    row = np.minimum(block * BLOCK, height - BLOCK)
+    x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
+    length = 2 * _HALF + 1
+    view = sliding_window_view(image.reshape(height, -1), 3 * length, axis=1)
+    first = view[row[:, None] + np.arange(BLOCK), 3 * (x - _HALF)[:, None]].reshape(-1, BLOCK, length, 3)
+    total = first.sum(axis=1, dtype=np.uint16)
+    core = total[:, _HALF - 2 : _HALF + 3]
+    side = total[:, :2].sum(axis=1) + total[:, -2:].sum(axis=1)
+    heights = (core.sum(axis=1) / (5.0 * BLOCK) - side / (4.0 * BLOCK)).astype(np.float32)
+    return heights, first[:, :, _HALF - 2 : _HALF + 3].max(axis=(1, 2))
+
+
+def _laser_share(candidates: Candidates, share: F32) -> float | None:
+    """Height of the line in other channels over its own: the purest that enough connected candidates agree on."""
+    telling = np.isfinite(share) & (candidates.snr > _TELLING_SNR)
+    # A candidate is part of a chain when the blocks above and below go on from it in place and colour.
+    with np.errstate(invalid="ignore"):
+        goes_on = np.abs(candidates.column[1:, None, :] - candidates.column[:-1, :, None]) <= CONNECTED_PX
+        goes_on &= np.abs(share[1:, None, :] - share[:-1, :, None]) <= 0.25
+    goes_on &= telling[1:, None, :] & telling[:-1, :, None]
+    chained = telling.copy()
+    for _ in range(2):
+        above = (goes_on & chained[:-1, :, None]).any(axis=1)
+        below = (goes_on & chained[1:, None, :]).any(axis=2)
+        chained[1:-1] &= above[:-1] & below[1:]
+        chained[0], chained[-1] = False, False
+    shares = np.sort(share[chained])
+    least = max(6.0, _CHAIN_SHARE * len(share))
+    if len(shares) < least:
+        return None
+    # The median of the purest part: as many candidates as a chain must have, twice over.
+    return float(shares[int(min(least, len(shares) - 1))])

@@ -1,0 +1,58 @@
+"""Verdicts over the whole line: what a row alone cannot know of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+NO_BLOB_PX = 2.3  # what is no wider, as sigma, can be a line at any resolution
+_CERTAIN, _BRIGHT = 0.06, 40.0  # sigma_px over width_px, and peak, of a row that is surely a line
+_UNEVEN_PX, _UNEVEN_HEIGHT = 3.0, 14.0
+_GAP_ROWS = 2  # missing rows that do not end a run
+
+
+def blobs(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
+    """Rows (H,) far wider across the line than the sharpest good part of it, unless near and therefore bright.
+
+    One beam has one width, which grows toward near things as the light does; what is wide and dim is a thing in
+    the room. The width across a slanted line is its width in the row times the cosine of the slant.
+    """
+    mask = np.zeros(len(column), bool)
+    found = np.flatnonzero(np.isfinite(column))
+    certain = (sigma[found] < _CERTAIN * width[found]) | (peak[found] > _BRIGHT)
+    if certain.sum() < 0.1 * len(found):
+        # Nothing here is surely a line, and what is wide is the room's.
+        mask[found[width[found] > NO_BLOB_PX]] = True
+        return mask
+    strong = peak[found] > 10.0 * sigma[found]
+    if strong.sum() < 20:
+        return mask
+    slope = np.zeros(len(column))
+    slope[1:-1] = 0.5 * (column[2:] - column[:-2])
+    slope = np.where(np.abs(slope) < 4.0, slope, 0.0)[found]
+    across, height = width[found] / np.sqrt(1.0 + slope**2), peak[found]
+    good = np.sort(across[strong])
+    sharp = good[int(0.4 * len(good))]
+    blob = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < 140.0)
+    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * np.median(height[strong]))
+    # As wide and dim as the unevenness of a wall.
+    blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
+    mask[found[blob]] = True
+    return mask
+
+
+def crumbs(column: Array, sigma: Array) -> Mask:
+    """Short runs of rows (H,) that no neighbour on either side continues: 3 rows always, 10 rows if weak."""
+    mask = np.zeros(len(column), bool)
+    found = np.flatnonzero(np.isfinite(column))
+    if not found.size:
+        return mask
+    linked = (np.abs(np.diff(column[found])) < 3.0) & (np.diff(found) <= _GAP_ROWS + 1)
+    number = np.concatenate([[0], np.cumsum(~linked)])
+    rows = np.bincount(number)
+    weak = np.bincount(number, sigma[found]) > 0.2 * rows
+    mask[found[((rows < 4) | (weak & (rows < 12)))[number]]] = True
+    return mask
