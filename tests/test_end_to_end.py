@@ -66,6 +66,23 @@ def test_sigma_is_the_error_to_expect(twin_scan: TwinScan) -> None:
     assert 0.2 < np.median(ratio) < 1.5
 
 
+def test_floor_is_found_where_it_is(twin_scan: TwinScan) -> None:
+    grid = twin_scan.result.grid
+    assert grid is not None and grid.floor is not None
+    assert grid.floor.how == "fitted"
+    assert grid.floor.laser_height_m == pytest.approx(1.0, abs=0.01)
+    assert grid.floor.tilt_deg < 0.5
+
+
+def test_floor_of_a_coarse_noisy_scan_is_not_a_layer_of_furniture(tmp_path: Path) -> None:
+    """At 640 columns a row's step along the floor is less than its noise, and tables outnumber the floor."""
+    small = ("calibration.image.width=640", "calibration.image.height=480", "sweep.step_deg=3.0")
+    grid = TwinScan(tmp_path, *small, "twin.sensor.jpeg_quality=80").result.grid
+    assert grid is not None and grid.floor is not None
+    assert grid.floor.how == "fitted"
+    assert grid.floor.laser_height_m == pytest.approx(1.0, abs=0.03)
+
+
 def true_cells(truth: Truth, grid: OccupancyGrid) -> np.ndarray:
     """Cells with a surface between 0.1 and 1.8 m above the floor: upright ones, and tops of things."""
     corner = (float(grid.origin[0]), float(grid.origin[1]))

@@ -76,9 +76,9 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
     low = level & (points[:, 2] < -0.02)
     if low.sum() >= _MIN_SUPPORT:
         # Floor, table and shelf are parallel: the strongest layer tells the tilt, the lowest strong one is the floor.
-        seed = _strongest_layer(points[low], np.radians(max_tilt_deg))
-        seed[2] = _lowest_layer(points[low], _refine(points[low], sigma[low], seed)[0])
-        slope, inliers, rms = _refine(points[low], sigma[low], seed)
+        # A leaning layer may gather bits of several things; upright counts where it explains more points.
+        tries = [_settled(points[low], sigma[low], np.radians(tilt)) for tilt in (max_tilt_deg, 0.0)]
+        slope, inliers, rms = max(tries, key=lambda found: found[1])
         steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
         if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep:
             return Floor(_plane(slope), rms, inliers, "fitted")
@@ -86,6 +86,13 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
         return Floor(np.array([0.0, 0.0, 1.0, laser_height_m]), np.nan, 0, "given")
     lowest = float(np.percentile(points[:, 2], 0.1)) if len(points) else 0.0
     return Floor(np.array([0.0, 0.0, 1.0, -lowest]), np.nan, int((points[:, 2] <= lowest).sum()), "lowest")
+
+
+def _settled(points: Array, sigma: Array, max_tilt: float) -> tuple[Array, int, float]:
+    """The lowest strong layer parallel to the strongest one: slope (3,), number of inliers, their rms [m]."""
+    seed = _strongest_layer(points, max_tilt)
+    seed[2] = _lowest_layer(points, _refine(points, sigma, seed)[0])
+    return _refine(points, sigma, seed)
 
 
 def _plane(slope: Array) -> Array:
@@ -124,11 +131,12 @@ def _strongest_layer(points: Array, max_tilt: float) -> Array:
     """z = a x + b y + c (3,) of the layer of 10 cm that holds most points, over a grid of tilts."""
     points = points[:: max(1, len(points) // 3000)]
     best, seed = -np.inf, np.zeros(3)
-    for a in np.tan(np.linspace(-max_tilt, max_tilt, 9)):
-        for b in np.tan(np.linspace(-max_tilt, max_tilt, 9)):
+    tilts = np.tan(np.linspace(-max_tilt, max_tilt, 9)) if max_tilt > 0 else np.zeros(1)
+    for a in tilts:
+        for b in tilts:
             count, bottom = _layers(points[:, 2] - a * points[:, 0] - b * points[:, 1], 0.05)
             k = int(count.argmax())
-            score = count[k] * (1.0 - 0.02 * np.hypot(a, b) / np.tan(max_tilt))  # between equals level wins
+            score = count[k] * (1.0 - 0.15 * np.hypot(a, b))  # between equals level wins
             if score > best:
                 best, seed = score, np.array([a, b, bottom + 0.05 * k])
     return seed
