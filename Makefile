@@ -52,4 +52,5 @@ demo: $(VENV)/.installed
 	rm -f recordings/demo.mcap recordings/demo.rrd
 	$(BIN)/scanmap scan --config twin-quick --record recordings/demo.mcap --rrd recordings/demo.rrd \
 	  --set calibration.image.width=640 --set calibration.image.height=480 --set twin.sensor.jpeg_quality=80 \
-	  --set view.image_width_px=320 --set view.thesis_every=6 --set view.thesis_width_px=320
+	  --set view.image_width_px=320 --set view.image_every=2 --set view.thesis_every=10 \
+	  --set view.thesis_width_px=240 --set view.max_points_per_shot=240 --set view.max_points_result=15000
