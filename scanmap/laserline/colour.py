@@ -64,7 +64,8 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     other = np.delete(height, channel, axis=1).max(axis=1)
     saturated = brightest[:, channel] >= COLOURLESS
     share = np.full(candidates.snr.shape, np.nan, np.float32)
-    share[block, which] = np.where(saturated, np.nan, other / own)
+    # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
+    share[block, which] = other / own
     laser = _laser_share(candidates, share)
     if laser is None or laser > _COLOURLESS_SHARE:
         return doubt

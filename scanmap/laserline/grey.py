@@ -81,8 +81,11 @@ def laser_channel(image: U8) -> int:
     """
     rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // _COLOUR_ROWS)])
     core = cv2.blur(rows, (3, 1))
-    padded = cv2.copyMakeBorder(core, 0, 0, 12, 12, cv2.BORDER_REPLICATE)
-    height = cv2.split(cv2.subtract(core, cv2.max(padded[:, :-24], padded[:, 24:])))
+    away = max(9, len(image) // 96)
+    padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
+    rises = np.asarray(cv2.subtract(core, cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])), np.uint8)
+    rises[rows.max(axis=2) >= SATURATED] = 0
+    height = cv2.split(rises)
     best = [np.sort(cv2.subtract(height[c], cv2.max(height[c - 1], height[c - 2])).max(axis=1)) for c in range(3)]
     strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
     # A grey picture in three channels has no excess at all: then the brightest line counts.

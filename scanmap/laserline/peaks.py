@@ -63,11 +63,13 @@ def fit_gaussian(
     n = len(y)
     x = (np.arange(n, dtype=np.float32) - n // 2)[:, None]
     clipped = np.asarray(~usable[n // 2 - 1 : n // 2 + 2].all(axis=0))
+    # What is left of a clipped line needs more of its background to be told four parameters from.
+    least = np.where(clipped, np.float32(6.0), np.float32(3.0))
     y = _levelled(y, x, sample_noise)
     fit = _start(y, x)
-    for _ in range(_ITERATIONS):
-        fit = _improve(y, x, usable * _near(x, fit, _REACH), fit)
-    weight = usable * _near(x, fit, _REACH)
+    for _ in range(_ITERATIONS + 2 * bool(clipped.any())):
+        fit = _improve(y, x, usable * _near(x, fit, _REACH, least), fit)
+    weight = usable * _near(x, fit, _REACH, least)
     bell = _bell(x, fit)
     residual = y - fit.b - fit.A * bell
     if contrast is None:
@@ -206,9 +208,9 @@ def _fit_speckle(y: F32, x: F32, usable: F32, fit: _Fit, sample_noise: float, co
     return model, weight
 
 
-def _near(x: F32, fit: _Fit, reach: float) -> F32:
+def _near(x: F32, fit: _Fit, reach: float, least: float | F32 = 3.0) -> F32:
     """1 for samples that say something of the line, else 0."""
-    near: F32 = (np.abs(x - fit.u) <= np.maximum(reach * fit.s, 3.0) + np.float32(0.5)).astype(np.float32)
+    near: F32 = (np.abs(x - fit.u) <= np.maximum(reach * fit.s, least) + np.float32(0.5)).astype(np.float32)
     return near
 
 

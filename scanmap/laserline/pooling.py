@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -11,6 +12,8 @@ Array = NDArray[np.float64]
 _BREAK_SIGMA, _BREAK_PX = 6.0, 0.35
 # A quadratic that misses its own rows by more than this (reduced chi^2) is not what the surface is.
 _MISFIT = 4.5
+# Chi^2 of a bend that is kept by half; share of a bend's variance that remains when nothing of it is kept.
+_BEND_DOUBT, _BEND_LEAST = 2.0, 0.5
 
 
 def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
@@ -62,30 +65,38 @@ def _segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np
 def _quadratic(
     column: Array, sigma: Array, at: NDArray[np.intp], start: NDArray[np.intp], stop: NDArray[np.intp], rows: int
 ) -> tuple[Array, Array, Array]:
-    """Value at `at`, its sigma, and reduced chi^2 of the weighted quadratic over each row's window."""
+    """Value at `at`, its sigma, and reduced chi^2 of the weighted quadratic over each row's window.
+
+    Most surfaces are straight over so few rows, and a bend that is not there costs half of what pooling gains: it
+    is shrunk by how far it stands out of its own uncertainty (James and Stein 1961).
+    """
     first = np.clip(at - rows // 2, start, np.maximum(stop - rows, start))
-    index = first[:, None] + np.arange(rows)
-    inside = index < stop[:, None]
-    index = np.minimum(index, len(column) - 1)
-    t = (index - at[:, None]) / (0.5 * rows)
-    weight = np.where(inside, 1.0 / np.maximum(sigma[index], 1e-4) ** 2, 0.0)
+    # One array row per row of support: every sum below runs along the rows of the image.
+    end = np.full(rows, np.nan)
     base = column[at]
-    y = np.where(inside, column[index] - base[:, None], 0.0)
-    powers = [weight, weight * t]
-    for _ in range(3):
-        powers.append(powers[-1] * t)
-    m = [power.sum(axis=1) for power in powers]
-    r = [np.einsum("ij,ij->i", power, y) for power in powers[:3]]
-    # Cramer's rule on [[m0 m1 m2] [m1 m2 m3] [m2 m3 m4]]; a trace of m0 on the diagonal keeps it regular.
-    a, d, f = m[0] * (1 + 1e-9), m[2] + 1e-9 * m[0], m[4] + 1e-9 * m[0]
-    b, c, e = m[1], m[2], m[3]
-    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
-    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
-    det = a * i00 + b * i01 + c * i02
-    c0 = (i00 * r[0] + i01 * r[1] + i02 * r[2]) / det
-    c1 = (i01 * r[0] + i11 * r[1] + i12 * r[2]) / det
-    c2 = (i02 * r[0] + i12 * r[1] + i22 * r[2]) / det
-    residual = y - (c0[:, None] + t * (c1[:, None] + t * c2[:, None]))
-    freedom = np.maximum(inside.sum(axis=1) - 3, 1)
-    chi2 = np.einsum("ij,ij,ij->i", weight, residual, residual) / freedom
-    return base + c0, np.sqrt(i00 / det), chi2
+    y = sliding_window_view(np.concatenate([column, end]), rows)[first].T - base
+    weight = 1.0 / np.maximum(sliding_window_view(np.concatenate([sigma, end]), rows)[first].T, 1e-4) ** 2
+    steps = first - at + np.arange(rows)[:, None]
+    if (stop - first).min() < rows:
+        outside = steps >= stop - at
+        y[outside] = weight[outside] = 0.0
+    t = steps * (2.0 / rows)
+    wt = weight * t
+    wtt = wt * t
+    m0, m1, m2 = weight.sum(axis=0), wt.sum(axis=0), wtt.sum(axis=0)
+    m3, m4 = (np.einsum("ij,ij->j", wtt, power) for power in (t, t * t))
+    r0, r1, r2 = (np.einsum("ij,ij->j", power, y) for power in (weight, wt, wtt))
+    # The straight line first, then what the bend adds to it, orthogonal to it.
+    det = m0 * m2 - m1 * m1 + 1e-9 * m0 * m0
+    c0, c1 = (m2 * r0 - m1 * r1) / det, (m0 * r1 - m1 * r0) / det
+    b0, b1 = (m2 * m2 - m1 * m3) / det, (m0 * m3 - m1 * m2) / det  # of t^2 by the straight line
+    power = np.maximum(m4 - b0 * m2 - b1 * m3, 1e-9 * m0)
+    bend = (r2 - c0 * m2 - c1 * m3) / power
+    significance = bend * bend * power
+    kept = significance / (significance + _BEND_DOUBT)
+    bend = bend * kept
+    value, variance = c0 - b0 * bend, m2 / det + b0 * b0 / power * (_BEND_LEAST + (1.0 - _BEND_LEAST) * kept)
+    residual = y - (c0 - b0 * bend) - t * (c1 - b1 * bend + t * bend)
+    freedom = np.maximum(np.minimum(stop - first, rows) - 3, 1)
+    chi2 = np.einsum("ij,ij->j", weight * residual, residual) / freedom
+    return base + value, np.sqrt(variance), chi2
