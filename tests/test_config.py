@@ -73,7 +73,7 @@ def test_unknown_section_names_the_valid_ones() -> None:
 
 @pytest.mark.parametrize("setting", ["sweep.step_deg", "=1", "sweep..step_deg=1", "description.x=1"])
 def test_malformed_setting_is_one_clear_line(setting: str) -> None:
-    with pytest.raises(ConfigError, match="--set|description"):
+    with pytest.raises(ConfigError, match=r"--set|description"):
         load(None, ["description=room", setting])
 
 
