@@ -137,7 +137,7 @@ def _strongest(
     """Columns at full resolution and responses (B, count) of the maxima of one resolution, 0 where below `least`."""
     first, last = limits
     blocks, width = response.shape
-    if np.ptp(first) <= 1.0 and np.ptp(last) <= 1.0:
+    if first.max() - first.min() <= 1.0 and last.max() - last.min() <= 1.0:
         response[:, : max(int(np.ceil(first[0])) // scale, 0)] = 0
         response[:, max(int(np.floor(last[0])) // scale + 1, 0) :] = 0
     else:

@@ -94,7 +94,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
     core, side = samples[:, :5].sum(axis=1, dtype=np.uint16), samples[:, 5:].sum(axis=1, dtype=np.uint16)
     height = core / 5.0 - side / 4.0
     by_run = np.stack([np.bincount(run, height[:, c]) for c in range(3)], axis=-1)
-    clipped = np.bincount(run, (samples[:, :5, channel].max(axis=1) >= COLOURLESS).astype(np.float64))
+    clipped = np.bincount(run, (samples[:, 2, channel] >= COLOURLESS).astype(np.float64))
     other = np.delete(by_run, channel, axis=1).max(axis=1)
     stranger = (other > _STRANGER * by_run[:, channel]) & (clipped < 0.3 * np.bincount(run))
     lost[row[stranger[run]]] = True

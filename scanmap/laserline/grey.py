@@ -83,9 +83,11 @@ def laser_channel(image: U8) -> int:
     core = cv2.blur(rows, (3, 1))
     away = max(9, len(image) // 96)
     padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
-    rises = np.asarray(cv2.subtract(core, cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])), np.uint8)
-    rises[rows.max(axis=2) >= SATURATED] = 0
-    height = cv2.split(rises)
+    height = cv2.split(cv2.subtract(core, cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])))
+    planes = cv2.split(rows)
+    brightest = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
+    _, white = cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)
+    height = [cv2.subtract(plane, white) for plane in height]
     best = [np.sort(cv2.subtract(height[c], cv2.max(height[c - 1], height[c - 2])).max(axis=1)) for c in range(3)]
     strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
     # A grey picture in three channels has no excess at all: then the brightest line counts.

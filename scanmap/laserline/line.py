@@ -164,9 +164,10 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     row, column = columns_of_rows(lit, path, window, noise)
     line = _located(plane, lit, (row, column), noise, params)
     line = _within(line, window)
-    line = _lost(line, runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.WIDE)
+    line = _lost(line, runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise), Reason.WIDE)
     if channel is not None and in_colour:
         line = _lost(line, strangers(line.column_px, image, channel), Reason.AMBIGUOUS)
+    line = _lost(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     line = _lost(line, runs.crumbs(line.column_px, line.sigma_px), Reason.AMBIGUOUS)
     if params.pool_rows >= 3:
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)

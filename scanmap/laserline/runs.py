@@ -9,12 +9,14 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NO_BLOB_PX = 2.3  # what is no wider, as sigma, can be a line at any resolution
+_NEAR = 140.0  # [grey levels] what is brighter can be a near line, wide by its own light
 _CERTAIN, _BRIGHT = 0.06, 40.0  # sigma_px over width_px, and peak, of a row that is surely a line
 _UNEVEN_PX, _UNEVEN_HEIGHT = 3.0, 14.0
+_INNER = 8  # rows of a run long enough to have ends and an inside
 _GAP_ROWS = 2  # missing rows that do not end a run
 
 
-def blobs(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
+def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) -> Mask:
     """Rows (H,) far wider across the line than the sharpest good part of it, unless near and therefore bright.
 
     One beam has one width, which grows toward near things as the light does; what is wide and dim is a thing in
@@ -22,8 +24,10 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
     """
     mask = np.zeros(len(column), bool)
     found = np.flatnonzero(np.isfinite(column))
-    certain = (sigma[found] < _CERTAIN * width[found]) | (peak[found] > _BRIGHT)
-    if certain.sum() < 0.1 * len(found):
+    # Known as well as the noise allows, or simply well.
+    bound = 1.062 * np.sqrt(width[found]) * max(noise, 1.0) / peak[found]
+    certain = (sigma[found] < np.maximum(1.3 * bound, _CERTAIN * width[found])) | (peak[found] > _BRIGHT)
+    if certain.sum() < 0.25 * len(found):
         # Nothing here is surely a line, and what is wide is the room's.
         mask[found[width[found] > NO_BLOB_PX]] = True
         return mask
@@ -36,11 +40,39 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
     across, height = width[found] / np.sqrt(1.0 + slope**2), peak[found]
     good = np.sort(across[strong])
     sharp = good[int(0.4 * len(good))]
-    blob = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < 140.0)
+    blob = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < _NEAR)
     blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * np.median(height[strong]))
     # As wide and dim as the unevenness of a wall.
     blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
     mask[found[blob]] = True
+    return mask
+
+
+def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
+    """Rows (H,) at depth edges in which the light of two surfaces, or half of one's, was taken for the line.
+
+    Ends of a run that are dim and have another width than the rows further in, and rows dimmer and wider than those
+    two above and two below.
+    """
+    mask = np.zeros(len(column), bool)
+    found = np.flatnonzero(np.isfinite(column))
+    if len(found) < _INNER:
+        return mask
+    broken = (np.diff(found) > 1) | ~(np.abs(np.diff(column[found])) < 3.0)
+    edges = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(found)]])
+    long = np.diff(edges) >= _INNER
+    for end, inward in ((edges[:-1][long], 1), (edges[1:][long] - 1, -1)):
+        inner = found[end[:, None] + inward * np.arange(3, 6)]
+        usual, bright = width[inner].mean(axis=1), peak[inner].mean(axis=1)
+        for k in range(2):
+            row = found[end + inward * k]
+            odd = np.abs(width[row] - usual) > 0.3 * usual + 2.0 * sigma[row]
+            mask[row[odd & (peak[row] < 0.6 * bright)]] = True
+    wide = np.fmax(width[:-4], width[4:])
+    bright = np.fmax(peak[:-4], peak[4:])
+    with np.errstate(invalid="ignore"):
+        shared = (width[2:-2] > 1.35 * wide + 0.1 + 4.0 * sigma[2:-2]) & (peak[2:-2] < 0.8 * bright)
+        mask[2:-2] |= shared & (peak[2:-2] < _NEAR)
     return mask
 
 
