@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 _HORIZONTAL_SLOPE = np.tan(np.radians(15.0))
 # Fewer candidates than this on the best plane, and there is no floor in view.
 _MIN_SUPPORT = 40
+# A surface with this share of all points more than that far below it is a table, not the floor.
+_MAX_BELOW, _CLEARLY_BELOW_M = 0.03, 0.1
 # How far a scanner put up by hand leans [rad]: it decides where the view alone cannot tell, as with one bearing.
 _LEAN = np.radians(2.0)
 
@@ -78,14 +80,21 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
         # Floor, table and shelf are parallel: the strongest layer tells the tilt, the lowest strong one is the floor.
         # A leaning layer may gather bits of several things; upright counts where it explains more points.
         tries = [_settled(points[low], sigma[low], np.radians(tilt)) for tilt in (max_tilt_deg, 0.0)]
-        slope, inliers, rms = max(tries, key=lambda found: found[1])
+        slope, inliers, rms = max(tries, key=lambda found: found[1] * (_share_below(points, found[0]) < _MAX_BELOW))
         steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
-        if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep:
+        above_others = _share_below(points, slope) >= _MAX_BELOW
+        if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep and not above_others:
             return Floor(_plane(slope), rms, inliers, "fitted")
     if laser_height_m is not None:
         return Floor(np.array([0.0, 0.0, 1.0, laser_height_m]), np.nan, 0, "given")
     lowest = float(np.percentile(points[:, 2], 0.1)) if len(points) else 0.0
     return Floor(np.array([0.0, 0.0, 1.0, -lowest]), np.nan, int((points[:, 2] <= lowest).sum()), "lowest")
+
+
+def _share_below(points: Array, slope: Array) -> float:
+    """Share of the points (N, 3) that lie clearly below a plane: of a floor none do but stray ones."""
+    height = points[:, 2] - points[:, :2] @ slope[:2] - slope[2]
+    return float((height < -_CLEARLY_BELOW_M).mean())
 
 
 def _settled(points: Array, sigma: Array, max_tilt: float) -> tuple[Array, int, float]:
