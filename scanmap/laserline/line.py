@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
+from scanmap.laserline.bars import find_bars
 from scanmap.laserline.candidates import find_candidates, noise_of
 from scanmap.laserline.colour import blocks_of, colour_doubt, strangers, without_colour
 from scanmap.laserline.cores import bright_core, centre_of_gravity
@@ -163,6 +164,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     path = choose_path(candidates, score, params.min_snr)
     row, column = columns_of_rows(lit, path, window, noise)
     line = _located(plane, lit, (row, column), noise, params)
+    _take_bars(line, plane, None if background is None else lit, noise, params)
     line = _within(line, window)
     line = _lost(line, runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise), Reason.WIDE)
     if channel is not None and in_colour:
@@ -244,6 +246,16 @@ def _take_cores(
     line.column_px[r] = column[sharp] + cores.offset_px[sharp]
     line.peak[r], line.width_px[r] = cores.contrast[sharp], cores.width_px[sharp]
     line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
+
+
+def _take_bars(line: LaserLine, plane: U8, lit: U8 | None, noise: float, params: LaserLineParams) -> None:
+    """Rows that no profile was found in, but a saturated bar with a beam's edges."""
+    if params.method != "gauss":
+        return
+    bars = find_bars(plane, np.flatnonzero(line.reason != Reason.OK), SATURATED, noise, lit)
+    r = bars.row
+    line.column_px[r], line.sigma_px[r] = bars.column, bars.sigma_px
+    line.width_px[r], line.peak[r], line.reason[r] = bars.width_px, bars.height, Reason.OK
 
 
 def _judged(peaks: Peaks, noise: float, params: LaserLineParams) -> NDArray[np.uint8]:

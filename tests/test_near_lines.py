@@ -1,0 +1,48 @@
+"""The line on a surface in reach of a hand: a saturated bar tens of columns wide, found by its two edges."""
+
+import cv2
+import numpy as np
+import pytest
+
+from scanmap.laserline import LaserLineParams, find_laser_line
+
+GAUSS = LaserLineParams()
+
+
+def srgb(light):
+    """Grey levels of linear light, 1 = saturation."""
+    light = np.clip(light, 0.0, 1.0)
+    return 255.0 * np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def near_line(column, sigma, peak, seed=0):
+    """A grey frame (H, 1600) of a beam far beyond saturation, with one per cent of veiling glare."""
+    light = peak * np.exp(-0.5 * ((np.arange(1600.0) - column[:, None]) / sigma) ** 2)
+    light = 0.99 * light + 0.01 * cv2.GaussianBlur(light, (0, 0), 6.0) + 0.02
+    scattered = srgb(light) + 1.5 * np.random.default_rng(seed).standard_normal(light.shape)
+    return np.clip(np.rint(scattered), 0, 255).astype(np.uint8)
+
+
+# Columns, beam widths and brightness of the thesis's head at 0.05, 0.1, 0.15 and 0.3 m.
+@pytest.mark.parametrize(("u", "sigma", "peak"), [(1530, 12.6, 150), (1072, 6.4, 38), (848, 4.2, 15), (530, 2.5, 8)])
+def test_the_line_is_found_down_to_the_nearest_range(u, sigma, peak):
+    column = u + 0.02 * (np.arange(400) - 200.0)
+    line = find_laser_line(near_line(column, sigma, peak), GAUSS)
+    off = line.column_px - column
+    assert np.isfinite(off).mean() >= 0.94
+    assert np.sqrt(np.nanmean(off**2)) < 0.03
+    assert abs(np.nanmean(off)) < 0.005
+
+
+def test_a_window_as_wide_as_a_bar_has_no_beams_edges():
+    image = np.full((400, 1600), 30.0)
+    image[40:360, 700:760] = 400.0
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    line = find_laser_line(np.clip(np.rint(image), 0, 255).astype(np.uint8), GAUSS)
+    assert np.isnan(line.column_px).all()
+
+
+def test_a_saturated_line_along_one_column_is_no_fault_of_the_sensor():
+    column = np.full(300, 400.2)
+    line = find_laser_line(near_line(column, 0.9, 3.0), GAUSS)
+    np.testing.assert_allclose(line.column_px, column, atol=0.1)
