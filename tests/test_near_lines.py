@@ -46,3 +46,22 @@ def test_a_saturated_line_along_one_column_is_no_fault_of_the_sensor():
     column = np.full(300, 400.2)
     line = find_laser_line(near_line(column, 0.9, 3.0), GAUSS)
     np.testing.assert_allclose(line.column_px, column, atol=0.1)
+
+
+NEAR = [(1530, 12.6, 150), (1264, 8.4, 70), (1072, 6.4, 38), (848, 4.2, 15), (698, 3.2, 11), (530, 2.5, 8)]
+
+
+@pytest.mark.parametrize(("u", "sigma", "peak"), NEAR)
+def test_a_red_bar_in_a_colour_jpeg_is_not_taken_for_its_blue_core(u, sigma, peak):
+    """Where red saturates over tens of columns, only green and blue are narrow there."""
+    column = u + 0.02 * (np.arange(400) - 200.0)
+    light = peak * np.exp(-0.5 * ((np.arange(1600.0) - column[:, None]) / sigma) ** 2)
+    light = 0.99 * light + 0.01 * cv2.GaussianBlur(light, (0, 0), 6.0)
+    image = np.stack([srgb(share * light + 0.02) for share in (0.015, 0.06, 1.0)], axis=-1)
+    image += 1.5 * np.random.default_rng(0).standard_normal(image.shape)
+    data = cv2.imencode(".jpg", np.clip(np.rint(image), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
+    line = find_laser_line(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8), GAUSS)
+    off = line.column_px - column
+    assert np.isfinite(off).mean() >= 0.95
+    assert np.sqrt(np.nanmean(off**2)) < 0.3
+    assert abs(np.nanmean(off)) < 0.02

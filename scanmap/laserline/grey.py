@@ -80,6 +80,9 @@ def laser_channel(image: U8) -> int:
     saturates every channel alike, its flanks still have the laser's colour.
     """
     rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // _COLOUR_ROWS)])
+    blazing = _blazing_channel(rows)
+    if blazing is not None:
+        return blazing
     core = cv2.blur(rows, (3, 1))
     away = max(9, len(image) // 96)
     padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
@@ -96,9 +99,26 @@ def laser_channel(image: U8) -> int:
     return int(np.argmax(strength))
 
 
+def _blazing_channel(rows: U8) -> int | None:
+    """The channel that is nearly saturated and alone in it, side by side, in a good part of the rows (n, W, 3).
+
+    On a near surface the line is a bar so wide that nothing of it is narrow in its own colour; what is narrow there
+    are the other channels. Nothing else in a room is as bright as that in one colour only.
+    """
+    planes = cv2.split(rows)
+    share = []
+    for c in range(3):
+        alone = cv2.subtract(planes[c], cv2.max(planes[c - 1], planes[c - 2])) > _ALONE
+        run = cv2.erode((alone & (planes[c] > _BLAZING)).view(np.uint8), np.ones((1, 5), np.uint8))
+        share.append(float(np.asarray(run).any(axis=1).mean()))
+    best = int(np.argmax(share))
+    return best if share[best] > 0.3 else None
+
+
 # What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
 PEDESTAL = 16
 SATURATED = 250  # [grey levels] from here on a sample says only "bright"
+_BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
 _ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
 
 

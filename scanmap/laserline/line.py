@@ -244,7 +244,10 @@ def _take_cores(
     sharp &= cores.width_px <= params.max_width_px
     r = row[sharp]
     line.column_px[r] = column[sharp] + cores.offset_px[sharp]
-    line.peak[r], line.width_px[r] = cores.contrast[sharp], cores.width_px[sharp]
+    # The contrast is over what is beside the core; the line's height is over what is beside the line.
+    beside = np.minimum(y[rows][:, :3].mean(axis=1), y[rows][:, -3:].mean(axis=1))
+    line.peak[r] = np.maximum(cores.contrast, y[rows].max(axis=1) - beside)[sharp]
+    line.width_px[r] = cores.width_px[sharp]
     line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
 
 
