@@ -65,6 +65,9 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
             f"configuration {choice.config} has rig = {config.rig!r}: it describes recordings, not a rig that is here; "
             f"try scanmap replay SOURCE --config {choice.config}"
         )
+    if config.sweep.mode == "adaptive":
+        # The sweep can do it, but nothing here tells it yet where to look closer: it would be a step sweep in disguise.
+        raise ConfigError("sweep.mode = 'adaptive' is not available in scan yet; valid here: step, continuous")
     outputs.check()
     if view:
         require_display(INSTEAD_OF_VIEW)
