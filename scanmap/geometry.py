@@ -112,12 +112,3 @@ def intersect_rays_plane(origin: Array, directions: Array, plane: Array) -> Arra
         t = -(plane[:3] @ origin + plane[3]) / along
     met: Array = np.where(np.isfinite(t), t, np.nan)
     return met
-
-
-def wrap_angle(angle: ArrayLike) -> Array:
-    """Angles [rad] brought to (-pi, pi]."""
-    a = np.asarray(angle, dtype=np.float64)
-    wrapped = np.pi - np.mod(np.pi - a, 2.0 * np.pi)
-    # A rounding error above pi would come out as -pi, which is not in the interval.
-    inside: Array = np.where(wrapped <= -np.pi, np.pi, wrapped)
-    return inside

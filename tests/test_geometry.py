@@ -17,7 +17,6 @@ from scanmap.geometry import (
     rotation_y,
     rotation_z,
     transform,
-    wrap_angle,
 )
 
 angles = st.floats(-10.0, 10.0)
@@ -142,18 +141,3 @@ def test_a_plane_fit_finds_the_plane_and_its_noise(T, seed, noise):
     assert abs(fit.normal @ T[:3, 3] + fit.d) < 5.0 * noise / np.sqrt(2000) + 1e-9
     # The standard deviation of 2000 deviates is known to 1.6 %; five times that is the bar.
     assert fit.rms_m == pytest.approx(noise, rel=0.08, abs=1e-6)
-
-
-@given(angle=st.floats(-1e6, 1e6))
-@settings(max_examples=300, deadline=None)
-def test_wrapped_angles_lie_in_one_turn_and_point_the_same_way(angle):
-    wrapped = float(wrap_angle(angle))
-    assert -np.pi < wrapped <= np.pi
-    assert np.cos(wrapped - angle) == pytest.approx(1.0, abs=1e-9)
-    assert np.sin(wrapped - angle) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_half_a_turn_is_plus_pi():
-    np.testing.assert_array_equal(wrap_angle([np.pi, -np.pi, np.nextafter(np.pi, 4), 3 * np.pi, 0.0])[[0, 1, 4]],
-                                  [np.pi, np.pi, 0.0])  # fmt: skip
-    assert wrap_angle(np.nextafter(np.pi, 4)) > -np.pi
