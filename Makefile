@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: scan test test-slow check bench demo lock dist clean
+.PHONY: scan test test-slow test-hardware check bench demo lock dist clean
 
 # A fresh machine needs python >= 3.11 with pip and venv, and make; nothing else, no root.
 $(VENV)/.installed: pyproject.toml
@@ -23,6 +23,9 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow
+
+test-hardware: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m hardware
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -31,10 +31,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": {"errors", "shot", "laserline", "calibration", "triangulation", "scan"},
     "view": CORE | {"pipeline", "grid"},
     "config": PARAMS | {"pipeline"},
-    "session": PARAMS | {"pipeline", "config", "raycast"},
-    "cli": PARAMS | {"pipeline", "config", "session"},
+    "solvers": CORE | {"recording", "grid", "pipeline", "view"},
+    "session": PARAMS | {"pipeline", "config", "solvers", "raycast"},
+    "cli": PARAMS | {"pipeline", "config", "solvers", "session"},
 }
-HEAVY = {"open3d", "rerun", "scipy", "rosbags", "mcap", "trimesh", "serial", "simplejpeg", "plyfile"}
+HEAVY = {"open3d", "rerun", "scipy", "rosbags", "mcap", "trimesh", "serial", "simplejpeg", "plyfile", "matplotlib"}
 FORBIDDEN_NAMES = {"utils", "common", "types", "helpers", "manager"}
 
 

@@ -1,0 +1,1 @@
+"""What makes a `Calibration` or judges one: boards, the laser plane, the axis, tables, rooms; and designs of heads."""
