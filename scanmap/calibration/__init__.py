@@ -2,9 +2,12 @@
 
 from scanmap.calibration.camera import Intrinsics
 from scanmap.calibration.file import CalibrationFile, HeadTable, ImageTable
+from scanmap.calibration.gates import GATES, check_residuals
 from scanmap.calibration.head import Calibration, PixelAngleModel, RatioModel
+from scanmap.calibration.uncertainty import Uncertainty, moved, parameters_of, uncertainty_of
 
 __all__ = [
+    "GATES",
     "Calibration",
     "CalibrationFile",
     "HeadTable",
@@ -12,4 +15,9 @@ __all__ = [
     "Intrinsics",
     "PixelAngleModel",
     "RatioModel",
+    "Uncertainty",
+    "check_residuals",
+    "moved",
+    "parameters_of",
+    "uncertainty_of",
 ]
