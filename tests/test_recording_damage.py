@@ -13,7 +13,7 @@ from recorded_shots import made_up_shots, record
 
 from scanmap.errors import CalibrationError, RecordingError
 from scanmap.recording import describe, open_source, recover
-from scanmap.recording.mcap_records import CHUNK, Record, open_mcap, walk
+from scanmap.recording.mcap_records import CHUNK, MESSAGE_INDEX, Record, open_mcap, walk
 from scanmap.shot import Shot
 
 
@@ -76,6 +76,18 @@ def test_a_flipped_byte_never_gives_a_wrong_image(tmp_path: Path, seed: int) -> 
     assert [s.image for s in shots[:hit]] == [s.image for s in got[:hit]]
     if len(got) < len(shots):
         assert faults
+
+
+def test_what_is_said_of_a_recording_survives_any_flipped_byte_of_its_indexes(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", made_up_shots(4))
+    data, true = path.read_bytes(), describe(path)
+    with open_mcap(path) as file:
+        indexes = [r for r in walk(file) if isinstance(r, Record) and r.opcode == MESSAGE_INDEX]
+    places = [at for index in indexes for at in range(index.offset, index.offset + index.length)]
+    for at in places[::7]:
+        path.write_bytes(data[:at] + bytes([data[at] ^ 0x41]) + data[at + 1 :])
+        said = describe(path)
+        assert (said.shots, said.duration_s, said.topics) == (true.shots, true.duration_s, true.topics), at
 
 
 def test_damage_costs_its_own_shot_and_is_reported(tmp_path: Path) -> None:

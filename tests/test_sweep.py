@@ -263,6 +263,10 @@ def test_a_plan_says_what_it_is() -> None:
     planned = plan(SweepParams(off_frames=True))
     assert planned.words.startswith("181 bearings from 0 to 180 deg every 1 deg, forward, laser on and off; about 1:12")
     assert planned.as_metadata()["shots"] == "181"
+    assert plan(SweepParams(start_deg=20, end_deg=20)).words.startswith("1 bearing at 20 deg; about")
+    assert plan(SweepParams(end_deg=0, passes=3)).words.startswith("3 shots at 0 deg;")
+    assert "deg, 1 pass; about" in plan(SweepParams(passes=1)).words
+    assert "then every 0.25 deg where it is needed; at least" in plan(SweepParams(mode="adaptive")).words
     assert set(map(type, planned.as_metadata().values())) == {str}
     with pytest.raises(ConfigError, match=r"sweep\.passes = 0"):
         plan(SweepParams(passes=0))

@@ -195,6 +195,22 @@ def message(view: memoryview) -> Message:
     return Message(channel_id, sequence, log_time, publish_time, view[22:])
 
 
+def content_offset(file: BinaryIO, chunk: Record) -> int | None:
+    """Where in the file the records of an uncompressed Chunk record begin; None for a compressed or damaged one."""
+    file.seek(chunk.offset + 28)
+    plain = file.read(4) == bytes(4)
+    return chunk.offset + 40 if plain and chunk.length >= 40 else None
+
+
+def message_head(file: BinaryIO, offset: int, chunk: Record) -> tuple[int, int] | None:
+    """Channel and log time of the Message record that stands at `offset` in a chunk; None if none does."""
+    if not chunk.offset <= offset <= chunk.offset + chunk.length - HEADER_BYTES - 22:
+        return None
+    file.seek(offset)
+    opcode, _, channel_id, _, log_time = struct.unpack("<BQHIQ", file.read(HEADER_BYTES + 14))
+    return (channel_id, log_time) if opcode == MESSAGE else None
+
+
 def _chunk_content(data: bytes) -> bytes | memoryview:
     try:
         _, _, size, crc, name_length = struct.unpack_from("<QQQII", data)

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanmap.recording import layout, mcap_records
 from scanmap.recording.mcap_records import Break, DamagedError, Directory, Record
 
 ATTACHMENT_LIMIT_BYTES = 1 << 24
+
+Entries = NDArray[np.uint64]  # (N, 2) of a message index: time [ns] and place in the chunk
 
 
 @dataclass
@@ -80,30 +83,52 @@ def outline(path: Path) -> Outline:
 
 
 def _count(found: Outline, file: BinaryIO, chunk: Record | None, indexes: list[bytes]) -> None:
-    """Count a chunk's messages by its index; one without, or with channels not known yet, is opened."""
+    """Count a chunk's messages by its index; one without a true one, or with channels not known yet, is opened."""
     if chunk is None:
         return
-    entries = {struct.unpack_from("<H", index)[0]: index for index in indexes if len(index) >= 6}
+    entries = {struct.unpack_from("<H", index)[0]: _entries(index) for index in indexes if len(index) >= 6}
+    if not _agrees(file, chunk, entries):
+        entries = {}
     if not entries or not entries.keys() <= found.directory.channels.keys():
         try:
-            _open(found, mcap_records.body(file, chunk), count=not entries)
+            opened = _open(found, mcap_records.body(file, chunk))
         except DamagedError:
             return  # reported by the reading of the shots
-    for channel_id, index in entries.items():
-        whole = (len(index) - 6) // 16 * 16
-        found.add(channel_id, np.frombuffer(index[6 : 6 + whole], "<u8")[::2])
+        entries = entries or opened
+    for channel_id, times_and_offsets in entries.items():
+        found.add(channel_id, times_and_offsets[:, 0])
         channel = found.directory.channels.get(channel_id)
         if channel is not None and channel.message_type == layout.DIAGNOSTIC_ARRAY:
             found.diagnostics.append(chunk)
 
 
-def _open(found: Outline, data: bytes, count: bool) -> None:
+def _entries(index: bytes) -> Entries:
+    whole = (len(index) - 6) // 16 * 16
+    return np.frombuffer(index[6 : 6 + whole], "<u8").reshape(-1, 2)
+
+
+def _agrees(file: BinaryIO, chunk: Record, entries: dict[int, Entries]) -> bool:
+    """Whether an index says what stands in its chunk: the format guards the one by a CRC, but not the other."""
+    content = mcap_records.content_offset(file, chunk)
+    if content is None:  # compressed: what others recorded is taken at its word
+        return True
+    for channel_id, times_and_offsets in entries.items():
+        for time, offset in times_and_offsets.tolist():
+            if mcap_records.message_head(file, content + offset, chunk) != (channel_id, time):
+                return False
+    return True
+
+
+def _open(found: Outline, data: bytes) -> dict[int, Entries]:
+    """Take in a chunk's topics; times of its messages by channel."""
+    times: dict[int, list[int]] = {}
     for opcode, view in mcap_records.chunk_records(data):
         if opcode in (mcap_records.SCHEMA, mcap_records.CHANNEL):
             found.directory.add(opcode, view)
-        elif opcode == mcap_records.MESSAGE and count:
+        elif opcode == mcap_records.MESSAGE:
             message = mcap_records.message(view)
-            found.add(message.channel_id, np.array([message.log_time], np.uint64))
+            times.setdefault(message.channel_id, []).append(message.log_time)
+    return {channel: np.array([[time, 0] for time in of_it], np.uint64) for channel, of_it in times.items()}
 
 
 def _note(found: Outline, file: BinaryIO, record: Record) -> None:

@@ -54,11 +54,27 @@ class Plan(NamedTuple):
         """One line for people."""
         sweep = self.params
         frames = ", laser on and off" if sweep.off_frames else ""
+        finer = f", then every {sweep.fine_deg:g} deg where it is needed" if sweep.mode == "adaptive" else ""
         minutes, seconds = divmod(round(self.time_s), 60)
-        return (
-            f"{len(self.bearings)} bearings from {sweep.start_deg:g} to {sweep.end_deg:g} deg every "
-            f"{sweep.step_deg:g} deg, {sweep.passes}{frames}; about {minutes}:{seconds:02d} min on a real head"
+        time = f"{'at least' if finer else 'about'} {minutes}:{seconds:02d} min"
+        return f"{self._where}{finer}{frames}; {time} on a real head"
+
+    @property
+    def _where(self) -> str:
+        sweep = self.params
+        if len(self.bearings) == 1:
+            return f"1 bearing at {sweep.start_deg:g} deg"
+        span = f"from {sweep.start_deg:g} to {sweep.end_deg:g} deg"
+        if len(np.unique(self.bearings)) == 1:
+            return f"{len(self.bearings)} shots at {sweep.start_deg:g} deg"
+        passes = (
+            sweep.passes
+            if isinstance(sweep.passes, str)
+            else "1 pass"
+            if sweep.passes == 1
+            else f"{sweep.passes} passes"
         )
+        return f"{len(self.bearings)} bearings {span} every {sweep.step_deg:g} deg, {passes}"
 
     def as_metadata(self) -> dict[str, str]:
         """What a recording keeps of it: text for every key."""
