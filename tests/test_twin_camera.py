@@ -78,6 +78,16 @@ def test_centre_of_the_decoded_line_is_true_to_a_fiftieth_of_a_pixel(bearing: fl
     assert np.abs(centre - expected).max() < 0.02
 
 
+def test_noise_belongs_to_the_view_whatever_was_shot_before() -> None:
+    params = TwinParams(room="box")
+    whole = shoot(params, head(320, 240), (0.1, True), (0.2, False), (0.2, True), (0.1, True))
+    assert whole[0] != whole[3]
+    assert shoot(params, head(320, 240), (0.2, True), (0.2, False), (0.1, True)) == [whole[2], whole[1], whole[0]]
+    camera = TwinCamera(build_scene(params, params.light), head(320, 240), params, lambda: (0.1, True))
+    camera.remember([0.1])
+    assert camera.grab().image == whole[3]
+
+
 def test_laser_off_is_the_same_picture_without_the_line() -> None:
     on, off = (pixels(data) for data in shoot(BOX, head(), (0.3, True), (0.3, False)))
     difference = on - off
@@ -190,7 +200,7 @@ def test_levels_are_rounded_not_cut_off(noise: bool) -> None:
     silent = CLEAN.model_copy(update={"noise": noise, "full_well_e": 1e12, "read_noise_dn": 0.0})
     sensor = Sensor(silent, len(levels), 1, np.random.default_rng(0))
     coded = np.repeat(np.rint(levels * STEPS).astype(np.int16)[None, :, None], 3, axis=2)
-    shown = decode_image(sensor.read_out(coded, sensor.noise_amplitude(coded))).image[0, :, 0]
+    shown = decode_image(sensor.read_out(coded, sensor.noise_amplitude(coded), np.random.default_rng(0))).image[0, :, 0]
     assert shown.tolist() == [0, 0, 1, 100, 101, 255, 255]
     np.testing.assert_allclose(sensor.code(sensor.light(coded)), coded, atol=1)
 

@@ -12,11 +12,13 @@ from scanmap.rig import Rig
 from scanmap.rig.stage import open_stage
 from scanmap.twin import Truth, TwinCamera, build_scene
 from scanmap.twin.firmware import Firmware
+from scanmap.twin.motion import Drivetrain
 from scanmap.twin.ports import plug
 
 # What everything made from the twin says of its source; `recording.layout` has the same words.
 TWIN_NAME = "digital twin"
 FRAME_PERIOD_S = 1 / 30
+STEPS_PER_DEG = 80.0  # of the twin's gear where the stage's settings leave it open
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,21 @@ class TwinRig:
     close: Callable[[], None]
 
 
+def _board(config: Config) -> Firmware:
+    """A board whose gear, switch and mark are what the stage's settings expect, unless `[twin.drive]` says else."""
+    drive = config.twin.drive
+    drivetrain = Drivetrain(
+        steps_per_deg=config.stage.steps_per_deg or STEPS_PER_DEG,
+        backlash_deg=drive.backlash_deg,
+        bearing_deg=drive.head_deg,
+    )
+    firmware = Firmware(drivetrain=drivetrain, switch_deg=drive.switch_deg, index_deg=drive.index_deg)
+    firmware.memory.settings[100] = drivetrain.steps_per_deg
+    if drive.switch_deg is not None:
+        firmware.memory.settings.update({22: 1, 23: 1, 130: 400.0})  # homing toward smaller bearings, over a full turn
+    return firmware
+
+
 def open_twin(config: Config, calibration: Calibration) -> TwinRig:
     """The twin's camera, and the real GRBL driver talking to the twin's firmware over pyserial.
 
@@ -38,7 +55,7 @@ def open_twin(config: Config, calibration: Calibration) -> TwinRig:
         StageError: the stage's settings do not fit the board.
     """
     scene = build_scene(config.twin, config.twin.light)
-    firmware = Firmware()
+    firmware = _board(config)
     lit_for_ever = config.stage.laser == "always-on"
     with ExitStack() as opened:
         url = opened.enter_context(plug(firmware))

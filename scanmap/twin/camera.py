@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import cv2
@@ -16,6 +17,7 @@ from scanmap.geometry import transform
 from scanmap.rig import Frame
 from scanmap.twin.laser import LaserFan, LaserParams, LineLight
 from scanmap.twin.light import LightParams
+from scanmap.twin.motion import DriveParams
 from scanmap.twin.optics import Lens
 from scanmap.twin.scene import RoomParams, Scene
 from scanmap.twin.sensor import STEPS, Coded, Sensor, SensorParams
@@ -33,6 +35,7 @@ class TwinParams(RoomParams, frozen=True, extra="forbid"):
     light: LightParams = LightParams()
     laser: LaserParams = LaserParams()
     sensor: SensorParams = SensorParams()
+    drive: DriveParams = DriveParams()
 
 
 class _Backdrop(NamedTuple):
@@ -53,6 +56,9 @@ class TwinCamera:
         state: gives the stage's true bearing [rad] and whether the laser is on, at the moment it is called.
         rng: of noise and speckle; left out, one from `params.seed`.
         clock: [s] monotonic.
+
+    Noise belongs to the view: the n-th picture at a bearing, with the laser on or off, is the same whatever was
+    shot before it, so that a scan in two parts equals one in a single go.
     """
 
     def __init__(
@@ -69,6 +75,8 @@ class TwinCamera:
         self._scene, self._calibration, self._params = scene, calibration, params
         self._state, self._clock = state, clock
         self._rng = np.random.default_rng(params.seed) if rng is None else rng
+        self._frames_seed = int(self._rng.integers(1 << 62))
+        self._visits: Counter[tuple[float, bool]] = Counter()
         self._sensor = Sensor(params.sensor, own.width, own.height, self._rng)
         self._fan = LaserFan(scene, calibration, params.laser, params.sensor.blur_px)
         self._speckle = _speckle_tile(params.laser.speckle, own.height, self._rng)
@@ -91,17 +99,29 @@ class TwinCamera:
         """A picture of the room at the bearing and with the laser as they are now."""
         bearing, laser_on = self._state()
         now = self._clock()
+        rng = self._noise_of(bearing, laser_on)
         backdrop = self._backdrop
         if backdrop is None or backdrop.bearing != bearing:
             backdrop = self._backdrop = self._look(bearing)
         if not laser_on:
-            return Frame(self._sensor.read_out(backdrop.coded, backdrop.amplitude), now)
+            return Frame(self._sensor.read_out(backdrop.coded, backdrop.amplitude, rng), now)
         coded, amplitude = backdrop.coded.copy(), backdrop.amplitude.copy()
-        self._add_line(coded, amplitude, self._fan.draw(self._fan.trace(bearing)))
-        return Frame(self._sensor.read_out(coded, amplitude), now)
+        self._add_line(coded, amplitude, self._fan.draw(self._fan.trace(bearing)), rng)
+        return Frame(self._sensor.read_out(coded, amplitude, rng), now)
+
+    def remember(self, bearings: Iterable[float]) -> None:
+        """Go on as after one picture with the laser off and one with it on at each of these true `bearings` [rad]."""
+        self._visits = Counter((bearing, on) for bearing in bearings for on in (True, False))
 
     def close(self) -> None:
         """Free nothing: there is no device."""
+
+    def _noise_of(self, bearing: float, laser_on: bool) -> np.random.Generator:
+        """The generator for the picture that is taken now."""
+        visit = self._visits[bearing, laser_on]
+        self._visits[bearing, laser_on] += 1
+        view = int(np.float64(bearing).view(np.uint64))
+        return np.random.default_rng([self._frames_seed, view, laser_on, visit])
 
     def _rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> F32:
         """Directions (N, 3) in the head frame."""
@@ -131,13 +151,13 @@ class TwinCamera:
             coded = np.asarray(cv2.GaussianBlur(coded, (3, 3), self._params.sensor.blur_px), np.int16)
         return _Backdrop(bearing, coded, self._sensor.noise_amplitude(coded))
 
-    def _add_line(self, coded: Coded, amplitude: NDArray[np.uint8], line: LineLight) -> None:
+    def _add_line(self, coded: Coded, amplitude: NDArray[np.uint8], line: LineLight, rng: np.random.Generator) -> None:
         """Add the laser's light to a coded picture, with speckle and glare."""
         if not line.light.size:
             return
         light = line.light * self._params.sensor.filter_rgb
         if self._params.laser.speckle > 0:
-            y, x = self._rng.integers(0, self._speckle.shape[0] - self.height + 1), self._rng.integers(0, 64)
+            y, x = rng.integers(0, self._speckle.shape[0] - self.height + 1), rng.integers(0, 64)
             columns = (np.arange(light.shape[1]) + x) % self._speckle.shape[1]
             light *= self._speckle[y : y + self.height, columns, None]
         margin = int(3.0 * self._params.sensor.glare_px) if self._params.sensor.glare > 0 else 0

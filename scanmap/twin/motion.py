@@ -7,6 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+
+class DriveParams(BaseModel, frozen=True, extra="forbid"):
+    """The twin's head as it stands and turns; `[twin.drive]`."""
+
+    head_deg: float = Field(
+        0.0, ge=-3600, le=3600, description="true bearing of the head when its board is switched on [deg]"
+    )
+    backlash_deg: float = Field(0.0, ge=0, le=10, description="play between motor and head [deg]")
+    switch_deg: float | None = Field(
+        None, ge=-3600, le=3600, description="true bearing of a limit switch, for stage.homing = 'switch' [deg]"
+    )
+    index_deg: float | None = Field(
+        None, ge=-3600, le=3600, description="true bearing of an index mark, for stage.homing = 'index' [deg]"
+    )
 
 
 @dataclass(frozen=True)

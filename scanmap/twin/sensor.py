@@ -47,12 +47,11 @@ class SensorParams(BaseModel, frozen=True, extra="forbid"):
 
 
 class Sensor:
-    """A camera's chip and its encoder; draws its noise from `rng`."""
+    """A camera's chip and its encoder; the tile its noise is cut from is drawn from `rng`."""
 
     def __init__(self, params: SensorParams, width: int, height: int, rng: np.random.Generator) -> None:
         self._params = params
         self._shape = (height, width)
-        self._rng = rng
         self._linear = self._decoded(np.arange(TOP * STEPS + 1) / STEPS).astype(np.float32)
         self._sigma = self._noise_per_level()
         self._work = np.empty((height, width, 3), np.int16)
@@ -80,11 +79,11 @@ class Sensor:
         level = cv2.convertScaleAbs(coded, alpha=1.0 / STEPS)
         return np.asarray(cv2.LUT(level, self._sigma), np.uint8)
 
-    def read_out(self, coded: Coded, amplitude: NDArray[np.uint8]) -> bytes:
-        """One picture (H, W, 3) RGB with its noise, encoded."""
+    def read_out(self, coded: Coded, amplitude: NDArray[np.uint8], rng: np.random.Generator) -> bytes:
+        """One picture (H, W, 3) RGB with its noise, encoded; `rng` says which."""
         work = self._work
         if self._params.noise:
-            y, x = self._rng.integers(0, TILE_MARGIN, 2)
+            y, x = rng.integers(0, TILE_MARGIN, 2)
             tile = self._tile[y : y + self._shape[0], x : x + self._shape[1]]
             np.multiply(amplitude, tile, out=work, dtype=np.int16, casting="unsafe")
             np.right_shift(work, 3, out=work)
