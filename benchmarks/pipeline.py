@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,7 +21,7 @@ import numpy as np
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import find_laser_line
-from scanmap.pipeline import Pipeline, run
+from scanmap.pipeline import Pipeline, Processes, run
 from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
 from scanmap.session.job import finished_scan
@@ -57,6 +56,12 @@ def cpu_ms(action: Callable[[int], object], repeats: int) -> float:
         action(k)
         spent.append(1e3 * (time.thread_time() - start))
     return float(np.median(spent))
+
+
+def peak_mb(pid: int) -> float:
+    """Largest resident memory of a process so far."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def main() -> None:
@@ -99,7 +104,10 @@ def main() -> None:
         decode_s = time.perf_counter() - start
         start = time.perf_counter()
         scan = Scan(head.mount, HEIGHT)
-        run(open_source(path).shots(), pipeline.process, [lambda s: scan.add(s.profile, s.shot.bearing)])
+        with Processes(pipeline) as workers:  # their start counts
+            sinks = [lambda step: scan.add(step.profile, step.shot.bearing)]
+            run(open_source(path).shots(), workers.process, sinks, workers=workers.threads)
+            worker_mb = [peak_mb(pid) for pid in workers.pids]
         replay_s = time.perf_counter() - start
         start = time.perf_counter()
         clean = finished_scan(scan, config)
@@ -110,7 +118,7 @@ def main() -> None:
     rate = options.frames / decode_s, options.frames / replay_s
     print(f"decode only {rate[0]:.1f} frames/s, replay to Scan {rate[1]:.1f} frames/s, ratio {replay_s / decode_s:.2f}")
     print(f"merge and filter {1e3 * finish_s:.0f} ms, grid {1e3 * grid_s:.0f} ms for {options.frames} bearings")
-    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(f"peak memory {peak_mb(os.getpid()):.0f} MB, of the workers {', '.join(f'{mb:.0f}' for mb in worker_mb)} MB")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The loop: order, memory, faults, and what comes through when the source breaks."""
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -11,7 +13,7 @@ import pytest
 from scanmap.calibration import Calibration, CalibrationFile
 from scanmap.errors import CalibrationError, StageError
 from scanmap.laserline import LaserLineParams, Reason
-from scanmap.pipeline import Pipeline, Step, checked, run
+from scanmap.pipeline import Pipeline, Processes, Step, checked, run, worth_processes
 from scanmap.shot import Shot, encode_png
 from scanmap.triangulation import TriangulationParams
 
@@ -144,3 +146,56 @@ def test_check_looks_past_a_damaged_first_image(head: Calibration) -> None:
 def test_image_of_another_size_in_the_middle_costs_only_itself(pipeline: Pipeline) -> None:
     step = pipeline.process(Shot(7, 0.0, 0.0, 0.0, encode_png(np.zeros((48, 64), np.uint8))))
     assert "64x48" in step.fault and not np.isfinite(step.profile.range_m).any()
+
+
+@pytest.fixture(scope="module")
+def processes(pipeline: Pipeline) -> Iterator[Processes]:
+    with Processes(pipeline, count=2) as workers:
+        yield workers
+
+
+def test_worker_processes_do_not_change_a_bit(pipeline: Pipeline, processes: Processes) -> None:
+    results = []
+    source = [*shots(9, jpeg=True), Shot(9, 0.0, 0.0, 0.0, b"\xff\xd8\xff nothing")]
+    for process, threads in ((pipeline.process, 1), (processes.process, processes.threads)):
+        steps: list[Step] = []
+        run(source, process, [steps.append], workers=threads)
+        assert [step.shot for step in steps] == source
+        results.append([(*(a.tobytes() for a in (*step.line, *step.profile)), step.fault) for step in steps])
+    assert results[0] == results[1]
+    assert "decoded" in results[1][-1][-1]
+
+
+def test_what_a_worker_process_raises_is_raised_here(head: Calibration) -> None:
+    broken = Pipeline(head, LaserLineParams(), TriangulationParams())
+    broken.window = np.zeros((3, 2))  # not one of this image's rows
+    with pytest.raises(Exception) as here:
+        broken.process(shots(1)[0])
+    with Processes(broken, count=1) as workers, pytest.raises(type(here.value)) as there:
+        workers.process(shots(1)[0])
+    assert str(there.value) == str(here.value)
+
+
+def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
+    steps: list[Step] = []
+    with Processes(pipeline, count=2) as workers:
+
+        def sink(step: Step) -> None:
+            steps.append(step)
+            if len(steps) == 3:
+                os.kill(workers.pids[0], signal.SIGKILL)
+
+        run(shots(12), workers.process, [sink], workers=workers.threads)
+    assert [step.shot.index for step in steps] == list(range(12))
+    assert all((step.line.reason == Reason.OK).mean() > 0.99 for step in steps)
+
+
+def test_no_worker_process_outlives_its_block(pipeline: Pipeline) -> None:
+    with pytest.raises(StageError), Processes(pipeline, count=2) as workers:
+        raise StageError("gone")
+    assert [worker._process.returncode for worker in workers._workers] == [0, 0]
+
+
+def test_worker_processes_only_where_there_is_enough_for_them() -> None:
+    assert not worth_processes(5)
+    assert worth_processes(1800) == worth_processes(None) == ((os.cpu_count() or 1) > 1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Generator, Iterable
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +17,7 @@ from scanmap.config import Config
 from scanmap.errors import RecordingError, ScanmapError
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import Reason
-from scanmap.pipeline import Pipeline, Sink, Step, checked, run
+from scanmap.pipeline import Pipeline, Processes, Sink, Step, checked, run, worth_processes
 from scanmap.recording import Recorder
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
@@ -76,6 +76,7 @@ class Job:
     total: int | None
     comments: dict[str, Any]  # go into every file: source, software version
     announcement: list[str] = field(default_factory=list)
+    recorded: bool = False  # the shots come as fast as they are read, not as a camera takes them
     recorder: Recorder | None = None
     view: View | None = None
     truth: Truth | None = None
@@ -110,8 +111,8 @@ class Job:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
             sinks = self._sinks(scan, faults, progress)
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
-            with closing(self._recorded()) as shots:
-                run(checked(shots, self.calibration), pipeline.process, sinks, stop)
+            with closing(self._recorded()) as shots, self._workers(pipeline) as (process, threads):
+                run(checked(shots, self.calibration), process, sinks, stop, threads)
             if stop():
                 ended = "interrupted"
         except KeyboardInterrupt:
@@ -128,6 +129,15 @@ class Job:
                 raise KeyboardInterrupt
             raise RecordingError("there is no shot to make a scan of")
         return self._finished(scan, faults, ended, error)
+
+    @contextmanager
+    def _workers(self, pipeline: Pipeline) -> Iterator[tuple[Callable[[Shot], Step], int]]:
+        """What processes a shot, and in how many threads; a live scan waits for its camera, not for a core."""
+        if not self.recorded or not worth_processes(self.total):
+            yield pipeline.process, 0
+            return
+        with Processes(pipeline) as workers:
+            yield workers.process, workers.threads
 
     def _recorded(self) -> Generator[Shot]:
         """The shots, each in the recording before anything is done with it."""

@@ -121,6 +121,7 @@ def prepare_replay(
         total=source.count,
         comments=_comments(is_twin=source.is_twin),
         announcement=[_announcement(source)],
+        recorded=True,
         source_faults=source.faults,
     )
     with _opened(job):

@@ -1,0 +1,172 @@
+"""Worker processes: every core with an interpreter of its own.
+
+Decoding a JPEG leaves the interpreter's lock, but finding the line is many short NumPy calls that hold it: two threads
+did the work of one and a half. The workers are started as programs of their own rather than by `multiprocessing`,
+which would run the user's script once more in each of them, or copy a process in which rerun's threads hold locks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+from types import TracebackType
+from typing import IO, NamedTuple, cast
+
+from scanmap.laserline import LaserLine
+from scanmap.pipeline.step import Pipeline, Step
+from scanmap.shot import Shot
+from scanmap.triangulation import Profile
+
+log = logging.getLogger(__name__)
+
+# Below so many shots a worker costs more to start (half a second) than it brings.
+WORTH_SHOTS = 100
+# Shots on their way to one worker: it finds the next image waiting when it is done with one.
+IN_FLIGHT = 2
+PATIENCE_S = 5.0
+# glibc gives large arrays back to the system as they are freed, and asking for them anew costs a fifth of a frame's
+# time in page faults; elsewhere these names mean nothing.
+_KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "1073741824", "MALLOC_TRIM_THRESHOLD_": "1073741824"}
+
+# The worker imports scanmap from where this process did.
+_START = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from scanmap.pipeline.processes import serve; serve(sys.stdin.buffer, sys.stdout.buffer)"
+)
+
+
+class Answer(NamedTuple):
+    """What a worker sends back: a Step without its Shot, or what it raised."""
+
+    line: LaserLine | None = None
+    profile: Profile | None = None
+    fault: str = ""
+    error: Exception | None = None
+
+
+def worth_processes(shots: int | None) -> bool:
+    """Whether worker processes shorten the work; None where the number of shots is not known."""
+    return (os.cpu_count() or 1) > 1 and (shots is None or shots >= WORTH_SHOTS)
+
+
+class Processes:
+    """Worker processes for one pipeline; a context manager that ends them.
+
+    `process` gives what `Pipeline.process` gives, bit for bit, and may be called from `threads` threads at once.
+    A worker that is killed is missed only in speed: its shots are processed here.
+    """
+
+    def __init__(self, pipeline: Pipeline, count: int = 0) -> None:
+        """Start `count` workers; 0 takes one per processor core. They are ready when their first shot comes."""
+        self.pipeline = pipeline
+        self._workers = [_Worker(pipeline) for _ in range(count or os.cpu_count() or 1)]
+        self.threads = IN_FLIGHT * len(self._workers)
+        self._free: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+        for _ in range(IN_FLIGHT):
+            for worker in self._workers:
+                self._free.put(worker)
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for worker in self._workers:
+            worker.close()
+
+    @property
+    def pids(self) -> list[int]:
+        """The workers' process numbers."""
+        return [worker.pid for worker in self._workers]
+
+    def process(self, shot: Shot) -> Step:
+        """`Pipeline.process`, done by whichever worker is free."""
+        worker = self._free.get()
+        try:
+            answer = worker.ask(shot)
+        except (OSError, EOFError, pickle.UnpicklingError, ValueError) as gone:
+            log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
+            return self.pipeline.process(shot)
+        finally:
+            self._free.put(worker)
+        if answer.line is None or answer.profile is None:
+            raise answer.error or RuntimeError("a worker process answered nothing")
+        return Step(shot, answer.line, answer.profile, answer.fault)
+
+
+class _Worker:
+    """One worker process and its two pipes."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        # A session of its own: Ctrl-C is for this process, which ends its workers when it is done.
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _START],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            env=os.environ | _KEEP_MEMORY,
+        )
+        self._to = cast(IO[bytes], self._process.stdin)
+        self._back = cast(IO[bytes], self._process.stdout)
+        self._sending = threading.Lock()
+        self._last_read = threading.Event()
+        self._last_read.set()
+        self.pid = self._process.pid
+        for first in (sys.path, pipeline):
+            pickle.dump(first, self._to, protocol=5)
+        self._to.flush()
+
+    def ask(self, shot: Shot) -> Answer:
+        """Send a shot, wait for its answer; answers come in the order of the shots, whichever thread asked."""
+        with self._sending:
+            before, read = self._last_read, threading.Event()
+            self._last_read = read
+            try:
+                pickle.dump(shot, self._to, protocol=5)
+                self._to.flush()
+            except BaseException:
+                read.set()
+                raise
+        try:
+            before.wait()
+            return cast(Answer, pickle.load(self._back))
+        finally:
+            read.set()
+
+    def close(self) -> None:
+        """End the worker: it stops when nothing more can come."""
+        with contextlib.suppress(OSError):  # it is gone already
+            self._to.close()
+        try:
+            self._process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._back.close()
+
+
+def serve(shots: IO[bytes], answers: IO[bytes]) -> None:
+    """The worker's own loop: a Pipeline first, then shots until the pipe closes."""
+    import cv2
+
+    cv2.setNumThreads(1)  # the workers are the parallelism
+    pipeline = cast(Pipeline, pickle.load(shots))
+    while True:
+        try:
+            shot = cast(Shot, pickle.load(shots))
+        except EOFError:
+            return
+        try:
+            step = pipeline.process(shot)
+            answer = Answer(step.line, step.profile, step.fault)
+        except Exception as error:
+            answer = Answer(error=error)
+        pickle.dump(answer, answers, protocol=5)
+        answers.flush()

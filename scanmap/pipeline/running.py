@@ -1,0 +1,102 @@
+"""The one loop, and its decode workers."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import chain
+
+import cv2
+
+from scanmap.calibration import Calibration
+from scanmap.errors import CameraError
+from scanmap.pipeline.step import Sink, Step
+from scanmap.shot import Shot, decode_image
+
+CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
+
+
+def checked(shots: Iterable[Shot], calibration: Calibration) -> Iterator[Shot]:
+    """The same shots, after the first readable images were held against the calibration.
+
+    One that fits is enough: a single odd image costs its own shot, not the scan.
+
+    Raises:
+        CalibrationError: the images have another size than the calibration; before anything is processed.
+    """
+    source = iter(shots)
+    seen: list[Shot] = []
+    odd: list[tuple[int, int]] = []
+    for shot in source:
+        seen.append(shot)
+        try:
+            height, width = decode_image(shot.image, grey=True).image.shape[:2]
+        except CameraError:
+            continue
+        if (width, height) == (calibration.intrinsics.width, calibration.intrinsics.height):
+            return chain(seen, source)
+        odd.append((width, height))
+        if len(odd) == CHECKED_IMAGES:
+            break
+    if odd:
+        calibration.check_image(*odd[0])
+    return chain(seen, source)
+
+
+def run(
+    shots: Iterable[Shot],
+    process: Callable[[Shot], Step],
+    sinks: Iterable[Sink],
+    stop: Callable[[], bool] = lambda: False,
+    workers: int = 0,
+) -> int:
+    """Process shots in parallel, hand the steps to every sink in the order of the shots; returns their number.
+
+    Args:
+        shots: the source; consumed in the caller's thread, a few shots ahead of the sinks, never more, so
+            that memory does not grow with the number of frames.
+        process: `Pipeline.process`, or `Processes.process` where there are many shots.
+        sinks: each called with every Step, in the caller's thread.
+        stop: asked before each shot; True ends the loop after what was begun.
+        workers: threads that call `process`; 0 takes one per processor core.
+
+    When the source raises, the steps already begun reach the sinks first.
+    """
+    workers = workers or os.cpu_count() or 1
+    sinks = tuple(sinks)
+    pending: deque[Future[Step]] = deque()
+    done = 0
+
+    def deliver() -> None:
+        nonlocal done
+        step = pending.popleft().result()
+        for sink in sinks:
+            sink(step)
+        done += 1
+
+    with _single_threaded_opencv(), ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
+        try:
+            for shot in shots:
+                pending.append(pool.submit(process, shot))
+                while len(pending) > 2 * workers or (pending and pending[0].done()):
+                    deliver()
+                if stop():
+                    break
+        finally:
+            while pending:
+                deliver()
+    return done
+
+
+@contextmanager
+def _single_threaded_opencv() -> Iterator[None]:
+    """The workers are the parallelism; OpenCV's own threads would only get in their way."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
