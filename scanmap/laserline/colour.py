@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 _COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
+_NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
@@ -80,8 +81,8 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
 def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
     """Rows (H,) in runs that stand out in another channel nearly as much as in the laser's own.
 
-    Over a whole run the shares of the channels are known far better than in a row. Runs whose core saturates are left
-    alone.
+    Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
+    parts are asked. Where the core saturates they say nothing.
     """
     lost = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
@@ -93,12 +94,26 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
     samples = image[row[:, None], x]
     core, side = samples[:, :5].sum(axis=1, dtype=np.uint16), samples[:, 5:].sum(axis=1, dtype=np.uint16)
     height = core / 5.0 - side / 4.0
-    by_run = np.stack([np.bincount(run, height[:, c]) for c in range(3)], axis=-1)
-    clipped = np.bincount(run, (samples[:, 2, channel] >= COLOURLESS).astype(np.float64))
-    other = np.delete(by_run, channel, axis=1).max(axis=1)
-    stranger = (other > _STRANGER * by_run[:, channel]) & (clipped < 0.3 * np.bincount(run))
-    lost[row[stranger[run]]] = True
+    clipped = (samples[:, 2, channel] >= COLOURLESS).astype(np.float64)
+    # Sums over rows as differences of sums from the start: of the whole run, and of the rows nearby.
+    total = np.concatenate([np.zeros((1, 4)), np.cumsum(np.column_stack([height, clipped]), axis=0)])
+    first, stop = np.searchsorted(run, run), np.searchsorted(run, run, side="right")
+    stranger = _in_other_channels(total, first, stop, channel)
+    if stranger.any():
+        index = np.arange(len(row))
+        stranger &= _in_other_channels(
+            total, np.maximum(index - _NEARBY, first), np.minimum(index + _NEARBY + 1, stop), channel
+        )
+        lost[row[stranger]] = True
     return lost
+
+
+def _in_other_channels(total: NDArray[np.float64], first: Index, stop: Index, channel: int) -> Mask:
+    """Whether rows `first` to `stop` (N,) stand out in another channel, of `total` heights and clipped rows."""
+    part = total[stop] - total[first]
+    other = np.delete(part[:, :3], channel, axis=1).max(axis=1)
+    in_other: Mask = (other > _STRANGER * part[:, channel]) & (part[:, 3] < 0.3 * (stop - first))
+    return in_other
 
 
 def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:

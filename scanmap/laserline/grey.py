@@ -133,9 +133,7 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
     Args:
         threshold: differences below it count as none [grey levels].
     """
-    on, off = plane[::8, ::8].astype(np.float32), background[::8, ::8].astype(np.float32)
-    usable = (off > 8) & (off < 240) & (on < 240)
-    gain = float(np.median(on[usable] / off[usable])) if usable.sum() > 50 else 1.0
+    gain = exposure_gain(plane, background)
     smooth = cv2.blur(background, (3, 3))
     around = np.ones((3, 3), np.uint8)
     rough = cv2.subtract(cv2.dilate(background, around), cv2.erode(background, around))
@@ -146,6 +144,13 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
     if threshold > 0:
         lit[lit < PEDESTAL + threshold] = PEDESTAL
     return np.asarray(lit, np.uint8)
+
+
+def exposure_gain(plane: U8, background: U8) -> float:
+    """What the laser-off plane must be multiplied by to match the laser-on one where neither saturates."""
+    on, off = plane[::8, ::8].astype(np.float32), background[::8, ::8].astype(np.float32)
+    usable = (off > 8) & (off < 240) & (on < 240)
+    return float(np.median(on[usable] / off[usable])) if usable.sum() > 50 else 1.0
 
 
 def binary_image(plane: U8) -> U8:

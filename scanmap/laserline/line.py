@@ -16,7 +16,17 @@ from scanmap.laserline.bars import find_bars
 from scanmap.laserline.candidates import find_candidates, noise_of
 from scanmap.laserline.colour import blocks_of, colour_doubt, strangers, without_colour
 from scanmap.laserline.cores import bright_core, centre_of_gravity
-from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, SATURATED, Grey, laser_channel, to_grey, without_background
+from scanmap.laserline.grey import (
+    CHANNEL,
+    NEIGHBOUR,
+    SATURATED,
+    Grey,
+    exposure_gain,
+    laser_channel,
+    to_grey,
+    without_background,
+)
+from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import by_width, choose_path, columns_of_rows, windows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool
@@ -34,6 +44,11 @@ _SIGMA_LEAST_PX = 0.003
 _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 # A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
+# Short runs of rows known no better than this are given up, and those that stand out of what is left of the room's own
+# edges by no more than the second; single rows by no more than the first.
+_WEAK_PX, _STANDS_OUT = 0.2, (2.0, 4.0)
+# A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
+_CORE_SHARE, _CORE_HALF = 0.4, 13
 
 
 class Reason(IntEnum):
@@ -151,6 +166,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     channel = _channel(image, background, params)
     plane = to_grey(image, params.grey, params.bit_index, channel)
     lit = plane
+    on, off = plane, None
     if background is not None:
         off = to_grey(background, params.grey, params.bit_index, channel)
         lit, plane = without_background(plane, off, params.off_threshold), np.asarray(cv2.max(plane, off), np.uint8)
@@ -166,11 +182,22 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     line = _located(plane, lit, (row, column), noise, params)
     _take_bars(line, plane, None if background is None else lit, noise, params)
     line = _within(line, window)
-    line = _lost(line, runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise), Reason.WIDE)
+    wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
+    at = np.flatnonzero(wide), np.rint(line.column_px[wide]).astype(np.intp)
+    widest = _CORE_SHARE * line.width_px[wide]
+    line = _lost(line, wide, Reason.WIDE)
+    if params.method == "gauss" and at[0].size:
+        y, _ = _samples(plane, lit, *at, _CORE_HALF)
+        _take_cores(line, at, y.T, widest, noise, params)
     if channel is not None and in_colour:
         line = _lost(line, strangers(line.column_px, image, channel), Reason.AMBIGUOUS)
     line = _lost(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
-    line = _lost(line, runs.crumbs(line.column_px, line.sigma_px), Reason.AMBIGUOUS)
+    weak = line.sigma_px > _WEAK_PX
+    if off is not None:
+        height = standing_out(line.column_px, line.peak, on, off, exposure_gain(on, off))
+        line = _lost(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
+        weak |= height < _STANDS_OUT[1]
+    line = _lost(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
     if params.pool_rows >= 3:
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
         line = line._replace(column_px=pooled, sigma_px=sigma)
@@ -209,7 +236,8 @@ def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: 
             misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
             reason[peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & (reason == Reason.OK)] = Reason.WIDE
             final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
-            _take_cores(line, (r, c), y.T, (reason != Reason.OK) & ~final, noise, params)
+            lost = (reason != Reason.OK) & ~final
+            _take_cores(line, (r[lost], c[lost]), y.T[lost], params.max_width_px, noise, params)
         good = reason == Reason.OK
         at_good = r[good]
         line.column_px[at_good], line.peak[at_good] = (c + offset)[good], peaks.height[good]
@@ -233,20 +261,20 @@ def _samples(seen: U8, lit: U8, row: Index, column: Index, half: int) -> tuple[F
 
 
 def _take_cores(
-    line: LaserLine, at: tuple[Index, Index], y: F32, rows: NDArray[np.bool_], noise: float, params: LaserLineParams
+    line: LaserLine, at: tuple[Index, Index], y: F32, widest: float | Array, noise: float, params: LaserLineParams
 ) -> None:
     """Where the profile is no Gaussian but has a core that stands out sharply, take the core."""
-    if not rows.any():
+    row, column = at
+    if not row.size:
         return
-    row, column = at[0][rows], at[1][rows]
-    cores = bright_core(y[rows])
+    cores = bright_core(y)
     sharp = (cores.contrast > max(_CORE_SNR * noise, _CORE_CONTRAST, params.min_peak)) & (np.abs(cores.offset_px) < 3.0)
-    sharp &= cores.width_px <= params.max_width_px
+    sharp &= cores.width_px <= widest
     r = row[sharp]
     line.column_px[r] = column[sharp] + cores.offset_px[sharp]
     # The contrast is over what is beside the core; the line's height is over what is beside the line.
-    beside = np.minimum(y[rows][:, :3].mean(axis=1), y[rows][:, -3:].mean(axis=1))
-    line.peak[r] = np.maximum(cores.contrast, y[rows].max(axis=1) - beside)[sharp]
+    beside = np.minimum(y[:, :3].mean(axis=1), y[:, -3:].mean(axis=1))
+    line.peak[r] = np.maximum(cores.contrast, y.max(axis=1) - beside)[sharp]
     line.width_px[r] = cores.width_px[sharp]
     line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
 

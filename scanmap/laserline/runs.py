@@ -76,8 +76,8 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
     return mask
 
 
-def crumbs(column: Array, sigma: Array) -> Mask:
-    """Short runs of rows (H,) that no neighbour on either side continues: 3 rows always, 10 rows if weak."""
+def crumbs(column: Array, weak: Mask) -> Mask:
+    """Short runs of rows (H,) that no neighbour on either side continues: 3 rows always, 11 if most are `weak` (H,)."""
     mask = np.zeros(len(column), bool)
     found = np.flatnonzero(np.isfinite(column))
     if not found.size:
@@ -85,6 +85,6 @@ def crumbs(column: Array, sigma: Array) -> Mask:
     linked = (np.abs(np.diff(column[found])) < 3.0) & (np.diff(found) <= _GAP_ROWS + 1)
     number = np.concatenate([[0], np.cumsum(~linked)])
     rows = np.bincount(number)
-    weak = np.bincount(number, sigma[found]) > 0.2 * rows
-    mask[found[((rows < 4) | (weak & (rows < 12)))[number]]] = True
+    doubtful = np.bincount(number, weak[found]) > 0.5 * rows
+    mask[found[((rows < 4) | (doubtful & (rows < 12)))[number]]] = True
     return mask

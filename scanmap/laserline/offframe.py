@@ -1,0 +1,55 @@
+"""What a laser-off frame cannot take away: where the room has contrast, no two pictures of it are the same."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_REACH = 2  # [px] on either side of a place whose contrast counts
+_CONTRAST = 16  # [grey levels] from which on a place has any
+_BRIGHTEST = 240  # [grey levels] brighter ones are cut
+_ROW_STEP = 8
+_FEW = 50
+
+
+def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> F64:
+    """Height of each row's line over what a shaken or recompressed edge leaves there in the difference.
+
+    Args:
+        column, peak: (H,) of the line, NaN where none.
+        image, background: (H, W) laser on and off.
+        gain: that the background is multiplied by.
+
+    Returns:
+        (H,) heights in standard deviations of what is left; infinite where the room is even, or has no line.
+
+    How much remains of a contrast is measured in the two pictures themselves, as a share of it.
+    """
+    ratio = np.full(len(column), np.inf)
+    row = np.flatnonzero(np.isfinite(column))
+    share = _remaining(image, background, gain) if row.size else 0.0
+    if share > 0.0:
+        middle = np.rint(column[row]).astype(np.intp)
+        x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, background.shape[1] - 1)
+        contrast = gain * np.ptp(background[row[:, None], x].astype(np.float32), axis=1)
+        uneven = contrast > _CONTRAST
+        ratio[row[uneven]] = peak[row[uneven]] / (share * contrast[uneven])
+    return ratio
+
+
+def _remaining(image: U8, background: U8, gain: float) -> float:
+    """Standard deviation of the difference over the contrast at that place, where there is contrast."""
+    on, off = (np.ascontiguousarray(plane[_ROW_STEP // 2 :: _ROW_STEP]) for plane in (image, background))
+    if not len(on):
+        return 0.0
+    around = np.ones((1, 2 * _REACH + 1), np.uint8)
+    contrast = np.asarray(cv2.subtract(cv2.dilate(off, around), cv2.erode(off, around)))
+    usable = (contrast * np.float32(gain) > _CONTRAST) & (cv2.max(on, off) < _BRIGHTEST)
+    if np.count_nonzero(usable) < _FEW:
+        return 0.0
+    left = np.abs(on[usable] - gain * off[usable].astype(np.float32))
+    return float(1.48 * np.median(left / (gain * contrast[usable])))
