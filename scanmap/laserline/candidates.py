@@ -48,7 +48,9 @@ def noise_of(plane: U8) -> float:
     return float(np.clip(median / 0.954, 0.3, 60.0))
 
 
-def find_candidates(plane: U8, window: F64, noise: float, min_snr: float, other: U8 | None = None) -> Candidates:
+def find_candidates(
+    plane: U8, window: F64, noise: float, min_snr: float, other: U8 | None = None, large: bool = False
+) -> Candidates:
     """The strongest narrow bright places of each block of rows.
 
     Args:
@@ -58,21 +60,20 @@ def find_candidates(plane: U8, window: F64, noise: float, min_snr: float, other:
         min_snr: where a block's best is below, no second one is looked for.
         other: (B, W) the middle rows' mean of a channel in which the laser hardly shows, by blocks; what stands
             out there too is a thing, not the line.
+        large: half the columns are enough for the finest search.
 
     The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
     have a bright side and score nothing. It is compared in grey levels, not in units of noise: what competes with
     the line is the room, not noise, and the room has more of everything the wider it is looked at.
     """
-    large = len(plane) >= _LARGE and plane.shape[1] >= 64
     shape = _Filter(3, 4) if large else _Filter(5, 7)
     own = _summed(plane, large)
     saturated = None if other is None else _saturated(plane, large)
     elsewhere = None if other is None else _halved(other) if large else np.left_shift(other, 2, dtype=np.uint16)
-    # A mean of the filter's centre, minus the larger of two such: 1.35 of one's noise.
-    scale, samples = (2, 2 * BLOCK) if large else (1, BLOCK)
+    scale = 2 if large else 1
     gain = BLOCK // scale  # of `own` over a grey level
-    unit = max(noise, 1.2) * 1.35 / np.sqrt(shape.centre * samples) * gain
-    limits = _block_window(window, len(own))
+    unit = gain * unit_of(noise, large)
+    limits = block_window(window)
     columns, snrs = [], []
     for level, count in enumerate(_PER_LEVEL):
         if level:
@@ -89,6 +90,17 @@ def find_candidates(plane: U8, window: F64, noise: float, min_snr: float, other:
         columns.append(column)
         snrs.append(value / np.float32(unit))
     return _apart(np.concatenate(columns, axis=1), np.concatenate(snrs, axis=1))
+
+
+def unit_of(noise: float, large: bool) -> float:
+    """Standard deviation of the finest response [grey levels]: a mean of the centre, minus the larger of two such."""
+    samples = 3 * 2 * BLOCK if large else 5 * BLOCK
+    return 1.35 * max(noise, 1.2) / float(np.sqrt(samples))
+
+
+def is_large(image: U8) -> bool:
+    """Whether half the columns of an (H, W) or (H, W, 3) picture are enough for the finest search."""
+    return bool(image.shape[0] >= _LARGE and image.shape[1] >= 64)
 
 
 def _summed(plane: U8, large: bool) -> U16:
@@ -178,8 +190,9 @@ def _apart(column: F32, value: F32) -> Candidates:
     return Candidates(np.take_along_axis(column, order, 1), np.take_along_axis(value, order, 1))
 
 
-def _block_window(window: F64, blocks: int) -> tuple[F64, F64]:
+def block_window(window: F64) -> tuple[F64, F64]:
     """First and last column (B,) that any row of a block can have."""
+    blocks = -(-len(window) // BLOCK)
     padded = np.full((blocks * BLOCK, 2), np.nan)
     padded[: len(window)] = window
     by_rows = padded.reshape(blocks, BLOCK, 2)

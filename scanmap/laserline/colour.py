@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
+from scanmap.laserline.grey import flat
 from scanmap.laserline.path import CONNECTED_PX
 
 F32 = NDArray[np.float32]
@@ -122,7 +123,7 @@ def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
     row = np.minimum(block * BLOCK, height - BLOCK)
     x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
     length = 2 * _HALF + 1
-    view = sliding_window_view(image.reshape(height, -1), 3 * length, axis=1)
+    view = sliding_window_view(flat(image), 3 * length, axis=1)
     first = view[row[:, None] + np.arange(BLOCK), 3 * (x - _HALF)[:, None]].reshape(-1, BLOCK, length, 3)
     total = first.sum(axis=1, dtype=np.uint16)
     core = total[:, _HALF - 2 : _HALF + 3]

@@ -6,6 +6,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from scanmap.errors import ConfigError
@@ -176,6 +177,14 @@ def overlay(plane: U8, column_px: NDArray[np.floating], colour: Literal["red", "
 def extract(image: U8, channel: int) -> U8:
     """One channel (H, W) of a BGR image."""
     return np.asarray(cv2.extractChannel(image, channel), np.uint8)
+
+
+def flat(image: U8) -> U8:
+    """An (H, W, 3) image's samples side by side, (H, 3 W), without a copy even of a part of a wider picture."""
+    height, width, channels = image.shape
+    if image.strides[1:] != (channels, 1):
+        return image.reshape(height, channels * width)
+    return as_strided(image, (height, channels * width), (image.strides[0], 1), writeable=False)
 
 
 def _bits(image: U8, n: int) -> U8:

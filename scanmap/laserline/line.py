@@ -6,30 +6,21 @@ from enum import IntEnum
 from functools import partial
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import find_bars
-from scanmap.laserline.candidates import find_candidates, noise_of
-from scanmap.laserline.colour import blocks_of, colour_doubt, strangers, without_colour
+from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
-from scanmap.laserline.grey import (
-    CHANNEL,
-    NEIGHBOUR,
-    SATURATED,
-    Grey,
-    exposure_gain,
-    laser_channel,
-    to_grey,
-    without_background,
-)
+from scanmap.laserline.grey import SATURATED, Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
-from scanmap.laserline.path import by_width, choose_path, columns_of_rows, windows
+from scanmap.laserline.path import by_width, columns_of_rows, windows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool
+from scanmap.laserline.search import search
+from scanmap.laserline.sight import Conversion, channel_of, sight_of
 
 Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -146,7 +137,7 @@ def find_laser_line(
     if window is None:
         window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
     if params.method == "brightest":
-        channel = _channel(image, background, params)
+        channel = channel_of(image, background, params.grey) if image.ndim == 3 else None
         return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
     if not np.isfinite(window).any():
         return _nothing(len(image), Reason.WINDOW)
@@ -160,41 +151,26 @@ def find_laser_line(
 
 
 def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Array) -> LaserLine:
-    if image.ndim == 3 and params.grey in ("auto", *CHANNEL) and without_colour(image):
-        # A monochrome camera's picture in three equal channels.
-        image, background = image[..., 1], background if background is None else background[..., 1]
-    channel = _channel(image, background, params)
-    plane = to_grey(image, params.grey, params.bit_index, channel)
-    lit = plane
-    on, off = plane, None
-    if background is not None:
-        off = to_grey(background, params.grey, params.bit_index, channel)
-        lit, plane = without_background(plane, off, params.off_threshold), np.asarray(cv2.max(plane, off), np.uint8)
-    noise = noise_of(lit)
-    in_colour = channel is not None and background is None
-    other = blocks_of(image, NEIGHBOUR[channel]) if channel is not None and in_colour else None
-    candidates = find_candidates(lit, window, noise, params.min_snr, other)
-    score = candidates.snr
-    if channel is not None and in_colour:
-        score = score * colour_doubt(image, channel, candidates, noise)
-    path = choose_path(candidates, score, params.min_snr)
-    row, column = columns_of_rows(lit, path, window, noise)
-    line = _located(plane, lit, (row, column), noise, params)
-    _take_bars(line, plane, None if background is None else lit, noise, params)
+    sight = sight_of(image, background, Conversion(params.grey, params.bit_index, params.off_threshold))
+    noise = sight.noise
+    row, column = columns_of_rows(sight.lit, search(sight, window, params.min_snr), window, noise)
+    line = _located(sight.plane, sight.lit, (row, column), noise, params)
+    _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
     line = _within(line, window)
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
     at = np.flatnonzero(wide), np.rint(line.column_px[wide]).astype(np.intp)
     widest = _CORE_SHARE * line.width_px[wide]
     line = _lost(line, wide, Reason.WIDE)
     if params.method == "gauss" and at[0].size:
-        y, _ = _samples(plane, lit, *at, _CORE_HALF)
+        y, _ = _samples(sight.plane, sight.lit, *at, _CORE_HALF)
         _take_cores(line, at, y.T, widest, noise, params)
-    if channel is not None and in_colour:
-        line = _lost(line, strangers(line.column_px, image, channel), Reason.AMBIGUOUS)
+    if sight.image is not None:
+        line = _lost(line, strangers(line.column_px, sight.image, sight.channel), Reason.AMBIGUOUS)
     line = _lost(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
-    if off is not None:
-        height = standing_out(line.column_px, line.peak, on, off, exposure_gain(on, off))
+    if sight.off is not None:
+        gain = exposure_gain(sight.on, sight.off)
+        height = standing_out(line.column_px, line.peak, sight.on, sight.off, gain)
         line = _lost(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
         weak |= height < _STANDS_OUT[1]
     line = _lost(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
@@ -202,15 +178,6 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
         pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
         line = line._replace(column_px=pooled, sigma_px=sigma)
     return line
-
-
-def _channel(image: U8, background: U8 | None, params: LaserLineParams) -> int | None:
-    """The channel that the line is looked for in; None for a grey image or a conversion that mixes them."""
-    if image.ndim == 2:
-        return None
-    if params.grey == "auto":
-        return laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
-    return CHANNEL.get(params.grey)
 
 
 def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: LaserLineParams) -> LaserLine:

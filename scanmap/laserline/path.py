@@ -14,7 +14,7 @@ U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
 
 CONNECTED_PX = 9.0  # a line does not run farther than this from block to block
-_JUMP = 1.6  # what leaving a line costs, in logarithms of signal to noise
+JUMP = 1.6  # what leaving a line costs, in logarithms of signal to noise
 _STATES = 4  # candidates that a block's path can choose from
 _PATH_WORTH = 0.15  # what a pixel away from the path costs, squared, in the noise of a sample
 _CONTEXT = 6  # blocks on either side of a contested one that decide with it
@@ -41,7 +41,7 @@ def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
     column = np.take_along_axis(candidates.column, order, 1)
     gain = np.log(np.maximum(np.take_along_axis(score, order, 1), 1e-3) / min_snr)
     chosen = np.where(gain[:, 0] > 0, column[:, 0], np.nan).astype(np.float32)
-    contested = np.flatnonzero(gain[:, 1] > 0)
+    contested = np.flatnonzero((gain[:, 1:2] > 0).any(axis=1))
     if not contested.size:
         return chosen
     # Stretches between blocks that nothing contests are decided on their own.
@@ -127,14 +127,14 @@ def _best_path(column: F32, gain: F32) -> F32:
     back: list[list[int]] = []
     for k in range(blocks):
         line = max(range(states), key=total.__getitem__)
-        from_none = total[states] - 0.5 * _JUMP
+        from_none = total[states] - 0.5 * JUMP
         fresh, came = [], []
         for j in range(states):
             if gains[k][j] <= 0:
                 fresh.append(-1e29)
                 came.append(states)
                 continue
-            value, source = total[line] - _JUMP, line
+            value, source = total[line] - JUMP, line
             if from_none > value:
                 value, source = from_none, states
             for i in range(states):
@@ -142,7 +142,7 @@ def _best_path(column: F32, gain: F32) -> F32:
                     value, source = total[i], i
             fresh.append(value + gains[k][j])
             came.append(source)
-        end = total[line] - 0.5 * _JUMP
+        end = total[line] - 0.5 * JUMP
         fresh.append(max(total[states], end))
         came.append(line if end > total[states] else states)
         total, where = fresh, [*columns[k], float("nan")]

@@ -1,0 +1,76 @@
+"""What the line is looked for in: the plane as the camera saw it, what of it the laser lit, and the noise."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline.candidates import BLOCK, is_large, noise_of
+from scanmap.laserline.colour import without_colour
+from scanmap.laserline.grey import CHANNEL, Grey, extract, laser_channel, to_grey, without_background
+
+U8 = NDArray[np.uint8]
+
+
+class Conversion(NamedTuple):
+    """How a colour picture becomes one plane; see `to_grey` and `without_background`."""
+
+    grey: Grey
+    bit_index: int
+    off_threshold: float
+
+
+class Sight(NamedTuple):
+    """One picture, seen in the laser's light."""
+
+    on: U8  # (H, W) the picture's plane; a view where one of its channels will do
+    off: U8 | None  # (H, W) the laser-off frame's
+    plane: U8  # (H, W) the brighter of both
+    lit: U8  # (H, W) what the laser added, lifted by PEDESTAL, with a laser-off frame; else the plane
+    rows: U8  # (B, W) of lit: the second row of each block, contiguous
+    image: U8 | None  # (H, W, 3) where colour tells the laser from other things
+    channel: int  # of the image; -1 without one
+    noise: float  # of a sample of lit [grey levels]
+
+
+def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
+    """Look at a grey (H, W) or BGR picture (H, W, 3), with the laser-off frame of the same view or None."""
+    if image.ndim == 3 and how.grey in ("auto", *CHANNEL) and without_colour(image):
+        # A monochrome camera's picture in three equal channels.
+        image, background = image[..., 1], background if background is None else background[..., 1]
+    channel = None
+    if image.ndim == 3:
+        channel = channel_of(image, background, how.grey)
+    if channel is not None and background is None:
+        rows = np.asarray(cv2.extractChannel(second_rows(image), channel), np.uint8)
+        # Most of a large picture is never looked at.
+        plane = image[..., channel] if is_large(image) else extract(image, channel)
+        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows))
+    on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
+    off = None
+    if background is not None:
+        off = to_grey(background, how.grey, how.bit_index, channel)
+        lit, plane = without_background(on, off, how.off_threshold), np.asarray(cv2.max(on, off), np.uint8)
+    rows = np.ascontiguousarray(second_rows(lit))
+    return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows))
+
+
+def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
+    """The channel of a BGR picture that the line is looked for in; None for a conversion that mixes them."""
+    if grey == "auto":
+        return laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
+    return CHANNEL.get(grey)
+
+
+def second_rows(image: U8) -> U8:
+    """The second row of each block of rows (B, ...)."""
+    rows = image[1::BLOCK]
+    return rows if len(rows) == -(-len(image) // BLOCK) else np.concatenate([rows, image[-1:]])
+
+
+def _noise(plane: U8, rows: U8) -> float:
+    # What is in the cache already, where it is enough.
+    return noise_of(rows if is_large(plane) else plane)
