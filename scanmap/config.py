@@ -23,6 +23,7 @@ from scanmap.errors import CalibrationError, ConfigError
 from scanmap.grid import GridParams
 from scanmap.laserline import LaserLineParams
 from scanmap.recording import RecordingParams
+from scanmap.rig.camera import CameraParams
 from scanmap.rig.stage import StageParams
 from scanmap.scan import ScanParams
 from scanmap.sweep import SweepParams
@@ -38,8 +39,10 @@ class Config(BaseModel, frozen=True, extra="forbid"):
     """One rig and how it scans; the whole of a rig's TOML."""
 
     description: str = Field("", description="what this rig is, for people")
-    rig: Literal["twin", "replay-only"] = Field(
-        "twin", description="twin: the digital twin; replay-only: for recordings of a head that is not here"
+    rig: Literal["twin", "hardware", "replay-only"] = Field(
+        "twin",
+        description="twin: the digital twin; hardware: [camera] and [stage]; replay-only: for recordings of a head "
+        "that is not here",
     )
     calibration: str | CalibrationFile | None = Field(
         None, description="path of a calibration.toml, or its tables inline; left out: the recording's own"
@@ -51,6 +54,7 @@ class Config(BaseModel, frozen=True, extra="forbid"):
     grid: GridParams = GridParams()
     recording: RecordingParams = RecordingParams()
     view: ViewParams = ViewParams()
+    camera: CameraParams = CameraParams()
     stage: StageParams = StageParams()
     twin: TwinParams = TwinParams()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import TracebackType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 
 class Frame(NamedTuple):
@@ -37,6 +37,19 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Free the device; may be called twice."""
+        ...
+
+
+@runtime_checkable
+class Streaming(Protocol):
+    """A camera that sends all the time: continuous sweeps and live views take its pictures as they come."""
+
+    def newest(self) -> Frame:
+        """The newest picture that was not handed out yet, whenever it was exposed; `Frame.time` says when.
+
+        Raises:
+            CameraError: no picture came, or it is unusable.
+        """
         ...
 
 

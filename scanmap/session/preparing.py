@@ -17,9 +17,10 @@ from scanmap.errors import ConfigError, RecordingError
 from scanmap.recording import Recorder, Source, open_source
 from scanmap.recording.opening import KINDS
 from scanmap.recording.video import VIDEO_SUFFIXES
+from scanmap.rig import Rig
 from scanmap.session.job import Job
 from scanmap.session.outputs import Outputs
-from scanmap.session.rigs import TWIN_NAME, open_twin
+from scanmap.session.rigs import TWIN_NAME, open_rig
 from scanmap.sweep import plan, sweep
 from scanmap.view import open_view, show
 from scanmap.view.viewer import has_display
@@ -60,7 +61,7 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
         ConfigError, CalibrationError, StageError, CameraError, RecordingError: before anything turns.
     """
     config = choice.load()
-    if config.rig != "twin":
+    if config.rig == "replay-only":
         raise ConfigError(
             f"configuration {choice.config} has rig = {config.rig!r}: it describes recordings, not a rig that is here; "
             f"try scanmap replay SOURCE --config {choice.config}"
@@ -73,21 +74,24 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
         require_display(INSTEAD_OF_VIEW)
     head = choice.head() or config.head()
     swept = plan(config.sweep, _limits(config))
-    twin = open_twin(config, head)
+    opened = open_rig(config, head)
+    is_twin = opened.rig.is_twin
     job = Job(
         config=config,
         calibration=head,
         outputs=outputs,
-        shots=lambda: sweep(twin.rig, config.sweep, sleep=twin.sleep, clock=twin.clock),
+        shots=lambda: sweep(opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock),
         total=len(swept.bearings),
-        comments=_comments(is_twin=True),
-        announcement=[f"DIGITAL TWIN: no hardware is used, the room is made up ({config.twin.room})", swept.words],
-        truth=twin.truth,
-        closers=[twin.close],
+        comments=_comments(is_twin=is_twin),
+        announcement=[_rig_words(config, opened.rig), swept.words],
+        truth=opened.truth,
+        closers=[opened.close],
     )
     with _opened(job):
-        _open_view(job, title=config.description or TWIN_NAME, is_twin=True, live=view)
-        job.recorder = _recorder(config, head, outputs, swept.as_metadata(), len(swept.bearings))
+        if not is_twin:
+            head.check_image(opened.rig.camera.width, opened.rig.camera.height)
+        _open_view(job, title=config.description or opened.rig.name, is_twin=is_twin, live=view)
+        job.recorder = _recorder(config, head, outputs, swept.as_metadata(), len(swept.bearings), opened.rig.name)
     return job
 
 
@@ -172,6 +176,14 @@ def _comments(*, is_twin: bool) -> dict[str, Any]:
     return comments
 
 
+def _rig_words(config: Config, rig: Rig) -> str:
+    """What is about to move, or that nothing is."""
+    if rig.is_twin:
+        return f"DIGITAL TWIN: no hardware is used, the room is made up ({config.twin.room})"
+    laser = "" if rig.stage.laser_switchable else "; its laser cannot be switched: it shines until you turn it off"
+    return f"rig: {rig.name}, pictures of {rig.camera.width}x{rig.camera.height}{laser}"
+
+
 def _announcement(source: Source) -> str:
     shots = "1 shot" if source.count == 1 else f"{'' if source.count is None else f'{source.count} '}shots"
     made_up = "; DIGITAL TWIN, its room is made up" if source.is_twin else ""
@@ -180,7 +192,7 @@ def _announcement(source: Source) -> str:
 
 
 def _recorder(
-    config: Config, head: Calibration, outputs: Outputs, planned: Mapping[str, object], shots: int
+    config: Config, head: Calibration, outputs: Outputs, planned: Mapping[str, object], shots: int, source: str
 ) -> Recorder | None:
     if outputs.record is None:
         return None
@@ -191,7 +203,7 @@ def _recorder(
         return Recorder(
             outputs.record,
             calibration=head,
-            source=TWIN_NAME,
+            source=source,
             rig_toml=rig_toml,
             plan=planned,
             expected_shots=shots,

@@ -1,35 +1,121 @@
-"""Open the rig a configuration names."""
+"""Open the rig a configuration names: the twin, or a camera and a stage of this machine."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+import numpy as np
+
 from scanmap.calibration import Calibration
 from scanmap.config import Config
-from scanmap.rig import Rig
+from scanmap.errors import ConfigError
+from scanmap.rig import Camera, Rig, Stage
+from scanmap.rig.camera import open_camera
 from scanmap.rig.stage import open_stage
-from scanmap.twin import Truth, TwinCamera, build_scene
+from scanmap.twin import DelayedCamera, Truth, TwinCamera, build_scene
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.motion import Drivetrain
 from scanmap.twin.ports import plug
 
 # What everything made from the twin says of its source; `recording.layout` has the same words.
 TWIN_NAME = "digital twin"
-FRAME_PERIOD_S = 1 / 30
 STEPS_PER_DEG = 80.0  # of the twin's gear where the stage's settings leave it open
 
 
 @dataclass(frozen=True)
-class TwinRig:
-    """The twin, opened: the rig, what is true of its room, and its own clock."""
+class OpenRig:
+    """A rig, opened, and the clock it lives by."""
 
     rig: Rig
-    truth: Truth
-    sleep: Callable[[float], None]  # passes the board's time: a fast-forward twin waits for nothing
-    clock: Callable[[], float]  # the board's time, which frames are stamped with [s]
-    close: Callable[[], None]
+    sleep: Callable[[float], None]  # a fast-forward twin passes its board's time and waits for nothing
+    clock: Callable[[], float]  # what frames are stamped with [s]
+    close: Callable[[], None]  # laser off, motor free, everything closed; may be called twice
+    truth: Truth | None = None  # of the twin's room
+
+
+def open_rig(config: Config, calibration: Calibration, ask: Callable[[str], str] = input) -> OpenRig:
+    """The rig that `config.rig` names, its laser off.
+
+    Args:
+        ask: shows a question to the user and returns the answer; for a head turned by hand.
+
+    Raises:
+        ConfigError: it names none, or the twin's room cannot be made.
+        CameraError, StageError: the device is missing, or does not do what it should.
+    """
+    if config.rig == "twin":
+        return open_twin(config, calibration)
+    if config.rig == "hardware":
+        return open_hardware(config, (calibration.intrinsics.width, calibration.intrinsics.height), ask)
+    raise ConfigError(
+        f"rig = {config.rig!r} describes recordings, not a rig that is here; try scanmap replay SOURCE, or set "
+        "rig = 'hardware' or 'twin'"
+    )
+
+
+def open_hardware(config: Config, size: tuple[int, int] | None, ask: Callable[[str], str] = input) -> OpenRig:
+    """The camera of `[camera]` and the stage of `[stage]`.
+
+    The camera first: a board that is opened may reset, home and turn, which is for nothing without a camera.
+
+    Args:
+        size: width and height [px] to ask the camera for, where `[camera]` names none.
+
+    Raises:
+        CameraError, StageError: the device is missing, or does not do what it should.
+    """
+    with ExitStack() as opened:
+        camera = open_camera(config.camera, size)
+        opened.callback(camera.close)
+        stage = open_stage(config.stage, ask)
+        rig = Rig(camera, stage, f"{_name(stage, config.stage.port)} + camera {_name(camera, config.camera.source)}")
+        opened.pop_all()
+        return OpenRig(rig, time.sleep, time.monotonic, rig.close)
+    raise AssertionError("unreachable")
+
+
+def open_twin(config: Config, calibration: Calibration) -> OpenRig:
+    """The twin's camera, and the real GRBL driver talking to the twin's firmware over pyserial.
+
+    Raises:
+        ConfigError: the twin's room cannot be made.
+        StageError: the stage's settings do not fit the board.
+    """
+    scene = build_scene(config.twin, config.twin.light)
+    firmware = _board(config)
+    lit_for_ever = config.stage.laser == "always-on"
+    with ExitStack() as opened:
+        url = opened.enter_context(plug(firmware))
+        stage = open_stage(config.stage.model_copy(update={"kind": "grbl", "port": url}))
+        opened.callback(stage.close)
+        camera = TwinCamera(
+            scene,
+            calibration,
+            config.twin,
+            state=lambda: (firmware.bearing, lit_for_ever or firmware.laser_on),
+            clock=lambda: firmware.now,
+        )
+        delayed = DelayedCamera(
+            camera,
+            clock=lambda: firmware.now,
+            wait=firmware.wait,
+            period_s=1.0 / config.twin.rate_hz,
+            latency_s=config.twin.latency_s,
+            jitter_s=config.twin.jitter_s,
+            corrected_s=config.camera.latency_s or 0.0,
+            rng=np.random.default_rng([config.twin.seed, 1]),
+        )
+        return OpenRig(
+            Rig(delayed, stage, TWIN_NAME, is_twin=True),
+            firmware.wait,
+            lambda: firmware.now,
+            opened.pop_all().close,
+            Truth(scene, calibration, config.twin.laser),
+        )
+    raise AssertionError("unreachable")
 
 
 def _board(config: Config) -> Firmware:
@@ -47,39 +133,6 @@ def _board(config: Config) -> Firmware:
     return firmware
 
 
-def open_twin(config: Config, calibration: Calibration) -> TwinRig:
-    """The twin's camera, and the real GRBL driver talking to the twin's firmware over pyserial.
-
-    Raises:
-        ConfigError: the twin's room cannot be made.
-        StageError: the stage's settings do not fit the board.
-    """
-    scene = build_scene(config.twin, config.twin.light)
-    firmware = _board(config)
-    lit_for_ever = config.stage.laser == "always-on"
-    with ExitStack() as opened:
-        url = opened.enter_context(plug(firmware))
-        stage = open_stage(config.stage.model_copy(update={"kind": "grbl", "port": url}))
-        opened.callback(stage.close)
-
-        def exposed() -> tuple[float, bool]:
-            if config.sweep.mode == "continuous":  # the head turns on while the next frame comes
-                firmware.wait(FRAME_PERIOD_S)
-            return firmware.bearing, lit_for_ever or firmware.laser_on
-
-        camera = TwinCamera(
-            scene,
-            calibration,
-            config.twin,
-            state=exposed,
-            clock=lambda: firmware.now,
-        )
-        rig = Rig(camera, stage, TWIN_NAME, is_twin=True)
-        return TwinRig(
-            rig,
-            Truth(scene, calibration, config.twin.laser),
-            firmware.wait,
-            lambda: firmware.now,
-            opened.pop_all().close,
-        )
-    raise AssertionError("unreachable")
+def _name(part: Camera | Stage, otherwise: object) -> str:
+    """What a camera or stage calls itself, else what the configuration calls it."""
+    return str(getattr(part, "name", "") or otherwise)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.errors import CameraError, ConfigError, ScanmapError
-from scanmap.rig import Camera, Frame, Rig
+from scanmap.rig import Camera, Frame, Rig, Streaming
 from scanmap.shot import Shot
 from scanmap.sweep.planning import CABLE_LIMITS, Plan, SweepParams, plan
 
@@ -146,7 +146,7 @@ def _turn(
         stage.start_turn(end, speed)
         last = -math.inf
         while abs(track[-1][1] - start) < abs(end - start) - 1e-4 and not stop():
-            frame = _grab(rig.camera, params.retries)
+            frame = _grab(rig.camera, params.retries, moving=True)
             track = [*track[-HISTORY:], _sample(rig, clock)]
             bearing = _steady_bearing(track, frame.time - params.latency_s, speed)
             if math.isnan(bearing) or abs(bearing - last) < math.radians(params.step_deg) * 0.99:
@@ -190,10 +190,11 @@ def _take(rig: Rig, params: SweepParams) -> tuple[Frame, bytes | None]:
     return _grab(rig.camera, params.retries), background
 
 
-def _grab(camera: Camera, retries: int) -> Frame:
+def _grab(camera: Camera, retries: int, *, moving: bool = False) -> Frame:
+    take = camera.newest if moving and isinstance(camera, Streaming) else camera.grab
     for attempt in range(retries + 1):
         try:
-            return camera.grab()
+            return take()
         except CameraError as error:
             if attempt == retries:
                 raise CameraError(

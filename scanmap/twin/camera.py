@@ -32,6 +32,11 @@ class TwinParams(RoomParams, frozen=True, extra="forbid"):
     """The digital twin; `[twin]` and its tables in a rig's TOML."""
 
     seed: int = Field(1, ge=0, description="of all noise: the same seed gives the same pictures")
+    rate_hz: float = Field(30.0, gt=0.0, le=1000.0, description="pictures a second, where the head turns meanwhile")
+    latency_s: float = Field(
+        0.0, ge=0.0, le=5.0, description="how much later than its exposure a picture is stamped [s]"
+    )
+    jitter_s: float = Field(0.0, ge=0.0, le=1.0, description="standard deviation of that [s]")
     light: LightParams = LightParams()
     laser: LaserParams = LaserParams()
     sensor: SensorParams = SensorParams()

@@ -1,0 +1,122 @@
+"""`rig = "hardware"`: a webcam and a board behind a pty, scanned by the same code as the twin."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_cameras import FakeCapture, FakeDevice
+
+from scanmap import config as configuration
+from scanmap import session
+from scanmap.errors import CalibrationError, CameraError, ConfigError, StageError
+from scanmap.recording import open_source
+from scanmap.rig import grbl as grbl_module
+from scanmap.session.rigs import open_rig
+from scanmap.twin import Truth, TwinCamera, build_scene
+from scanmap.twin.firmware import Firmware
+from scanmap.twin.ports import pty_port
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
+
+HARDWARE = (
+    "rig=hardware", "calibration.image.width=320", "calibration.image.height=240", "sweep.end_deg=40",
+    "sweep.step_deg=10", "sweep.settle_s=0.0", "stage.watchdog=false", "camera.source=0", "camera.latency_s=0.0",
+    "camera.exposure_us=1000",
+)  # fmt: skip
+
+
+class Head:
+    """A webcam and a board on one head, in the twin's room; the program sees them as hardware."""
+
+    def __init__(self) -> None:
+        self.config = configuration.load("twin-room", HARDWARE)
+        self.board = Firmware()
+        self.scene = build_scene(self.config.twin, self.config.twin.light)
+        self.camera = TwinCamera(self.scene, self.config.head(), self.config.twin, state=self._state)
+        self.device = FakeDevice(period_s=0.02, sizes=((320, 240),), picture=lambda _: self.camera.grab().image)
+
+    def _state(self) -> tuple[float, bool]:
+        return self.board.bearing, self.board.laser_on
+
+
+@pytest.fixture
+def head(monkeypatch: pytest.MonkeyPatch) -> Head:
+    head = Head()
+    real = cv2.VideoCapture
+    fake = lambda target, *rest: FakeCapture(head.device) if target == 0 else real(target, *rest)  # noqa: E731
+    monkeypatch.setattr(cv2, "VideoCapture", fake)
+    monkeypatch.setattr(grbl_module, "BOOT_S", 0.1)
+    return head
+
+
+@pytest.fixture
+def choice(head: Head) -> Iterator[session.Choice]:
+    with pty_port(head.board) as url:
+        yield session.Choice("twin-room", (*HARDWARE, f"stage.port={url}"))
+
+
+def test_a_scan_of_hardware_is_as_good_as_the_twins_and_says_no_twin(
+    head: Head, choice: session.Choice, tmp_path: Path
+) -> None:
+    outputs = session.Outputs((tmp_path / "room.ply",), record=tmp_path / "room.mcap")
+    with session.prepare_scan(choice, outputs, view=False) as job:
+        result = job.run(lambda _: None, lambda: False)
+        assert job.announcement[0].startswith("rig: grbl on /dev/") and "camera 0" in job.announcement[0]
+    assert result.ended == "finished" and not result.faults and result.truth is None
+    np.testing.assert_allclose(np.degrees(result.scan.bearings), [0, 10, 20, 30, 40], atol=1e-9)
+    truth = Truth(head.scene, job.calibration, head.config.twin.laser)
+    report = truth.compare(result.scan.points[result.scan.valid], result.scan.bearings)
+    assert report.median_m < 0.02 and report.completeness > 0.8
+    source = open_source(tmp_path / "room.mcap")
+    assert not source.is_twin
+    for shot in source.shots():
+        assert shot.image.startswith(b"\xff\xd8")
+    assert b"digital twin" not in (tmp_path / "room.ply").read_bytes()[:2000]
+    assert not head.board.laser_on and not head.board.motor_on
+    assert head.device.released == head.device.opened
+
+
+def test_a_missing_part_is_said_before_anything_turns_and_leaves_nothing(
+    head: Head, choice: session.Choice, tmp_path: Path
+) -> None:
+    outputs = session.Outputs((tmp_path / "room.ply",), record=tmp_path / "room.mcap")
+    head.device.unplugged = True
+    with pytest.raises(CameraError, match="camera 0 cannot be opened"):
+        session.prepare_scan(choice, outputs, view=False)
+    head.device.unplugged = False
+    with pytest.raises(StageError, match="nothing-here"):
+        session.prepare_scan(
+            session.Choice("twin-room", (*HARDWARE, "stage.port=/dev/nothing-here")), outputs, view=False
+        )
+    head.device.sizes, head.device.picture = ((64, 48),), None
+    with pytest.raises(CalibrationError, match="image is 64x48, the calibration is for 320x240"):
+        session.prepare_scan(choice, outputs, view=False)
+    assert not list(tmp_path.iterdir())
+    assert head.device.released == head.device.opened
+    assert not head.board.laser_on
+
+
+def test_a_camera_lost_in_mid_scan_keeps_what_was_scanned(head: Head, choice: session.Choice, tmp_path: Path) -> None:
+    outputs = session.Outputs((tmp_path / "room.ply",), record=tmp_path / "room.mcap")
+    settings = (*choice.settings, "camera.timeout_s=0.2", "sweep.retries=1")
+
+    def lose(progress: session.Progress) -> None:
+        head.device.unplugged = progress.bearing_deg >= 10
+
+    with session.prepare_scan(session.Choice("twin-room", settings), outputs, view=False) as job:
+        result = job.run(lose, lambda: False)
+    assert isinstance(result.error, CameraError) and "no usable frame after 2 tries" in str(result.error)
+    assert len(result.scan.bearings) >= 2
+    assert (tmp_path / "room.ply").exists()
+    assert not head.board.laser_on and not head.board.motor_on
+
+
+def test_replay_only_is_no_rig() -> None:
+    config = configuration.load("srv-turntable")
+    with pytest.raises(ConfigError, match=r"replay-only.*hardware"):
+        open_rig(config, config.head())
