@@ -94,10 +94,9 @@ class FakeCapture:
         time.sleep(max(0.0, self.due - time.monotonic()))
         if device.unplugged:
             return False, None
+        self.stamp = time.monotonic() + device.latency_s
         picture = device.picture(self.size) if device.picture else noisy(device.rng, size=self.size)
-        time.sleep(device.latency_s)
-        self.stamp = time.monotonic()
-        time.sleep(device.transfer_s)
+        time.sleep(max(0.0, self.stamp + device.transfer_s - time.monotonic()))
         if not self.raw:
             return True, picture if isinstance(picture, np.ndarray) else simplejpeg.decode_jpeg(picture, "BGR")
         data = picture if isinstance(picture, bytes) else as_jpeg(picture)
