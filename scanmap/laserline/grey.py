@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
@@ -81,17 +82,19 @@ def laser_channel(image: U8) -> int:
     saturates every channel alike, its flanks still have the laser's colour.
     """
     rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // _COLOUR_ROWS)])
-    blazing = _blazing_channel(rows)
+    planes = [np.asarray(plane, np.uint8) for plane in cv2.split(rows)]
+    blazing = _blazing_channel(planes)
     if blazing is not None:
         return blazing
-    core = cv2.blur(rows, (3, 1))
     away = max(9, len(image) // 96)
-    padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
-    height = cv2.split(cv2.subtract(core, cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])))
-    planes = cv2.split(rows)
     brightest = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
     _, white = cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)
-    height = [cv2.subtract(plane, white) for plane in height]
+    height = []
+    for plane in planes:
+        core = cv2.blur(plane, (3, 1))
+        padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
+        side = cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])
+        height.append(cv2.subtract(cv2.subtract(core, side), white))
     best = [np.sort(cv2.subtract(height[c], cv2.max(height[c - 1], height[c - 2])).max(axis=1)) for c in range(3)]
     strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
     # A grey picture in three channels has no excess at all: then the brightest line counts.
@@ -100,26 +103,30 @@ def laser_channel(image: U8) -> int:
     return int(np.argmax(strength))
 
 
-def _blazing_channel(rows: U8) -> int | None:
-    """The channel that is nearly saturated and alone in it, side by side, in a good part of the rows (n, W, 3).
+def _blazing_channel(planes: Sequence[U8]) -> int | None:
+    """The channel that is nearly saturated and alone in it, side by side, in a good part of the rows (n, W) of three.
 
     On a near surface the line is a bar so wide that nothing of it is narrow in its own colour; what is narrow there
     are the other channels. Nothing else in a room is as bright as that in one colour only.
     """
-    planes = cv2.split(rows)
-    share = []
+    share = [0.0, 0.0, 0.0]
     for c in range(3):
-        alone = cv2.subtract(planes[c], cv2.max(planes[c - 1], planes[c - 2])) > _ALONE
-        run = cv2.erode((alone & (planes[c] > _BLAZING)).view(np.uint8), np.ones((1, 5), np.uint8))
-        share.append(float(np.asarray(run).any(axis=1).mean()))
+        some = np.flatnonzero(planes[c].max(axis=1) > _BLAZING)
+        if len(some) > _MANY * len(planes[c]):
+            plane, one, two = (np.ascontiguousarray(planes[k][some]) for k in (c, c - 1, c - 2))
+            _, alone = cv2.threshold(cv2.subtract(plane, cv2.max(one, two)), _ALONE, 255, cv2.THRESH_BINARY)
+            _, bright = cv2.threshold(plane, _BLAZING, 255, cv2.THRESH_BINARY)
+            run = np.asarray(cv2.erode(cv2.min(alone, bright), np.ones((1, 5), np.uint8)))
+            share[c] = np.count_nonzero(run.max(axis=1)) / len(planes[c])
     best = int(np.argmax(share))
-    return best if share[best] > 0.3 else None
+    return best if share[best] > _MANY else None
 
 
 # What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
 PEDESTAL = 16
 SATURATED = 250  # [grey levels] from here on a sample says only "bright"
 _BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
+_MANY = 0.3  # share of the rows
 _ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
 
 

@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import COLOURLESS
-from scanmap.laserline.grey import flat
+from scanmap.laserline.colour import heights_of
 from scanmap.laserline.path import CONNECTED_PX, JUMP
 
 F64 = NDArray[np.float64]
@@ -20,7 +20,7 @@ U16 = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
 _CENTRE, _AWAY = 3, 4  # of the filter: width of its centre, distance of its sides, at each resolution
-_LEVELS = 3  # resolutions: sums of 2, 4 and 8 columns
+_EDGE = _AWAY + _CENTRE // 2  # columns on either side that the filter cannot judge
 _APART_PX = 14.0  # what is nearer to the lead is its own
 _LEAST_SNR = 12.0  # of a lead that is believed
 _SETTLED = 2.0  # how far a chain's leads are ahead of their rivals, in costs of a jump there and back
@@ -37,30 +37,34 @@ class Leads(NamedTuple):
 
 
 def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
-    """The best place of each block, and the next best at three resolutions.
+    """The best place of each block, and the next best at two resolutions.
 
     Args:
         rows: (B, W) one row of each block.
         limits: first and last column (B,) that a block's line can have, NaN where it can have none.
     """
     sums, scale = _halved(rows), 2
-    response = _allowed(_stands_out(sums), scale, limits)
     index = np.arange(len(rows))
+    response = _allowed(_stands_out(sums), scale, limits)
     at = response.argmax(axis=1)
-    height = response[index, at].astype(np.float32) * np.float32(1.0 / 6.0)
-    column = (scale * at + 0.5 * (scale - 1)).astype(np.float32)
-    rival = np.zeros_like(height)
-    for level in range(_LEVELS):
-        if level:
-            sums, scale = _halved(sums), 2 * scale
-            if sums.shape[1] <= 2 * _AWAY:
-                break
-            response = _allowed(_stands_out(sums), scale, limits)
-        reach = max(int(_APART_PX) // scale, _CENTRE + 1)
-        runs = sliding_window_view(response, min(2 * reach + 1, response.shape[1]), axis=1, writeable=True)
-        runs[index, np.clip(column.astype(np.intp) // scale - reach, 0, runs.shape[1] - 1)] = 0
-        np.maximum(rival, response.max(axis=1) * np.float32(1.0 / (_CENTRE * scale)), out=rival)
+    column = (scale * (at + _EDGE) + 0.5 * (scale - 1)).astype(np.float32)
+    height = response[index, at] * np.float32(1.0 / (_CENTRE * scale))
+    rival = _highest_elsewhere(response, at, scale)
+    sums, scale = _halved(sums), 2 * scale
+    if sums.shape[1] > 2 * _EDGE + 2:
+        response = _allowed(_stands_out(sums), scale, limits)
+        np.maximum(rival, _highest_elsewhere(response, (at + _EDGE) // 2 - _EDGE, scale), out=rival)
     return Leads(column, height, rival)
+
+
+def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> F32:
+    """The highest response (B,) of each block apart from the place `at` (B,) [grey levels]."""
+    length = min(2 * max(int(_APART_PX) // scale, _CENTRE + 1) + 1, response.shape[1])
+    runs = sliding_window_view(response, length, axis=1, writeable=True)
+    # Whole runs of memory are cleared at once, ten times the speed of picking samples one by one.
+    runs[np.arange(len(at)), np.clip(at - length // 2, 0, runs.shape[1] - 1)] = 0
+    highest: F32 = response.max(axis=1) * np.float32(1.0 / (_CENTRE * scale))
+    return highest
 
 
 def settled(leads: Leads, noise: float, min_snr: float) -> Mask:
@@ -90,18 +94,11 @@ def of_one_colour(rows: U8, leads: Leads, channel: int, good: Mask) -> Mask:
     """
     block = np.flatnonzero(good)
     pure = np.zeros(len(rows), bool)
-    width = rows.shape[1]
-    if not block.size or width < 19:
+    if not block.size:
         return pure
-    x = np.clip(np.rint(leads.column[block]).astype(np.intp), 9, width - 10)
-    runs = sliding_window_view(flat(rows), 57, axis=1)[block, 3 * (x - 9)]
-    samples = np.ascontiguousarray(runs.T).reshape(19, 3, -1).astype(np.int16)
-    core = samples[7] + samples[8] + samples[9] + samples[10] + samples[11]
-    side = samples[0] + samples[1] + samples[17] + samples[18]
-    height = core * np.float32(0.2) - side * np.float32(0.25)
-    own = height[channel]
-    other = np.maximum(height[channel - 1], height[channel - 2])
-    saturated = samples[7:12, channel].max(axis=0) >= COLOURLESS
+    height, middle = heights_of(rows, block, np.rint(leads.column[block]).astype(np.intp))
+    own, other = height[channel], np.maximum(height[channel - 1], height[channel - 2])
+    saturated = middle[channel] >= COLOURLESS
     # The mean over neighbours on the same line is known far better than one row's.
     share = cv2.blur(np.stack([other, own]), (5, 1), borderType=cv2.BORDER_REPLICATE)
     pure[block] = saturated | ((other < _PURE * own) | (share[0] < 0.9 * _PURE * share[1]))
@@ -121,30 +118,31 @@ def _halved(values: U8 | U16) -> U16:
 
 
 def _stands_out(values: U16) -> U16:
-    """Sum over the line's width minus the brighter of its two sides, at least 0; 0 where a side is missing."""
+    """Sum over the line's width minus the brighter of its two sides, at least 0, from column _EDGE on."""
     summed = values[:, :-2] + values[:, 1:-1]
     summed += values[:, 2:]
     side = cv2.max(summed[:, : -2 * _AWAY], summed[:, 2 * _AWAY :])
-    response = cv2.subtract(summed[:, _AWAY:-_AWAY], side)
-    edge = _AWAY + _CENTRE // 2
-    return np.asarray(cv2.copyMakeBorder(response, 0, 0, edge, edge, cv2.BORDER_CONSTANT, value=0), np.uint16)
+    return np.asarray(cv2.subtract(summed[:, _AWAY:-_AWAY], side), np.uint16)
 
 
 def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
     """The response, 0 outside the limits, in place."""
     first, last = limits
     width = response.shape[1]
-    none = np.isnan(first)
-    response[none] = 0
-    if none.all():
-        return response
-    ends = np.array([np.nanmin(first), np.nanmax(first), np.nanmin(last), np.nanmax(last)]) / scale
-    left, inner_left, inner_right, right = np.clip(np.rint(ends), -1, width).astype(np.intp)
-    response[:, : max(left, 0)] = 0
+    some = ~np.isnan(first)
+    if not some.all():
+        response[~some] = 0
+        first, last = first[some], last[some]
+        if not first.size:
+            return response
+    # In columns of the response, which lacks the picture's edge; only between the extremes do rows differ.
+    ends = np.array([first.min(), first.max(), last.min(), last.max()]) / scale - _EDGE
+    left, inner_left, inner_right, right = np.clip(np.rint(ends), 0, width).astype(np.intp)
+    response[:, :left] = 0
     response[:, right + 1 :] = 0
-    # Only between the extremes do rows differ.
-    for start, stop in ((max(left, 0), inner_left + 1), (max(inner_right, 0), right + 1)):
-        x = np.arange(start, min(stop, width), dtype=np.float32) * scale + 0.5 * (scale - 1)
+    for start, stop in ((left, inner_left + 1), (inner_right, right + 1)):
         if stop - start > 2:
-            response[:, start:stop][~((x >= first[:, None] - scale) & (x <= last[:, None] + scale))] = 0
+            x = np.arange(start + _EDGE, min(stop, width) + _EDGE, dtype=np.float32) * scale + 0.5 * (scale - 1)
+            outside = ~((x >= limits[0][:, None] - scale) & (x <= limits[1][:, None] + scale))
+            response[:, start:stop][outside] = 0
     return response
