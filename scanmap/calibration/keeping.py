@@ -1,0 +1,58 @@
+"""Writing a calibration without losing the one that is there."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from scanmap.calibration.head import Calibration
+from scanmap.errors import CalibrationError, ConfigError
+
+
+def refuse_path(path: Path) -> None:
+    """Raise ConfigError where no calibration can be written; before anything is measured or solved."""
+    if path.suffix.lower() != ".toml":
+        raise ConfigError(f"--out {path}: a calibration must end in .toml; try {path.with_suffix('.toml')}")
+    if path.is_dir():
+        raise ConfigError(f"--out {path} is a folder; give the name of a file in it")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(f"--out {path}: there is no folder {path.absolute().parent}; make it first")
+
+
+def save_beside(calibration: Calibration, path: Path) -> Path | None:
+    """Write a calibration whole or not at all; one that was there is kept beside it.
+
+    Returns:
+        Where the old one is now (`calibration.toml.1`, the next free number), or None where there was none.
+
+    Raises:
+        CalibrationError: it cannot be written; the old one is then still in its place.
+    """
+    text, kept = calibration.dumps(), None
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", dir=path.absolute().parent, prefix=f".{path.name}.", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        new = Path(file.name)
+        try:
+            new.chmod(0o644)
+            kept = _kept(path) if path.exists() else None
+            new.replace(path)
+        finally:
+            new.unlink(missing_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"calibration {path} cannot be written: {error.strerror or error}") from error
+    return kept
+
+
+def _kept(path: Path) -> Path:
+    """A copy of the file at `path` under its name with the next free number."""
+    number = 1
+    while (beside := path.with_name(f"{path.name}.{number}")).exists():
+        number += 1
+    beside.write_bytes(path.read_bytes())
+    return beside
