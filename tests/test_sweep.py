@@ -254,7 +254,7 @@ def test_gaps_are_filled_evenly_and_only_where_asked(n: int, fine: float, mask: 
 
 
 def test_a_sweep_can_begin_where_another_ended(rig: Rig, firmware: Firmware) -> None:
-    shots = list(sweep(rig, SweepParams(step_deg=10), sleep=firmware.wait, first=15))
+    shots = list(sweep(rig, SweepParams(step_deg=10), sleep=firmware.wait, done=range(15)))
     assert [shot.index for shot in shots] == [15, 16, 17, 18]
     assert shots[0].bearing_commanded == pytest.approx(math.radians(150))
 
@@ -328,7 +328,7 @@ def run(board: TroubledBoard, first: int = 0) -> tuple[list[tuple[int, float, st
         with plug(board) as url:
             stage = open_stage(StageParams(port=url, timeout_s=0.1, homing="switch", home_deg=-2.0, min_deg=-2))
             with Rig(FakeCamera(board), stage, "digital twin", is_twin=True) as rig:
-                for shot in sweep(rig, params, sleep=board.wait, first=first):
+                for shot in sweep(rig, params, sleep=board.wait, done=range(first)):
                     where, laser = picture(shot.image)
                     assert picture(shot.background) == (where, "off")
                     assert math.degrees(shot.bearing) == pytest.approx(where, abs=1e-4)

@@ -101,9 +101,21 @@ class GrblStage:
         self._link.in_motion = True
         self._link.command(f"G53 G1 X{self._x_of(target):.4f} F{math.degrees(speed) * 60:.1f}")
 
+    @property
+    def homes_itself(self) -> bool:
+        """Whether `home` needs nobody's hand."""
+        return self._params.homing != "hand"
+
     def where(self) -> float:
-        """The bearing reported now [rad]."""
-        return math.radians(self._where_deg())
+        """The bearing reported now [rad].
+
+        Raises:
+            StageError: no answer, or the place is lost.
+        """
+        here = self._where_deg()
+        if self._link.fault:
+            raise StageError(self._link.fault)
+        return math.radians(here)
 
     def laser(self, on: bool) -> None:
         """Switch the laser; does nothing where it cannot be switched.

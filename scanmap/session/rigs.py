@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,13 @@ TWIN_NAME = "digital twin"
 STEPS_PER_DEG = 80.0  # of the twin's gear where the stage's settings leave it open
 
 
+class TwinDevices(NamedTuple):
+    """What only a twin has: devices whose knobs are the faults that a scan can be put through."""
+
+    firmware: Firmware
+    camera: TwinCamera
+
+
 @dataclass(frozen=True)
 class OpenRig:
     """A rig, opened, and the clock it lives by."""
@@ -34,6 +42,7 @@ class OpenRig:
     clock: Callable[[], float]  # what frames are stamped with [s]
     close: Callable[[], None]  # laser off, motor free, everything closed; may be called twice
     truth: Truth | None = None  # of the twin's room
+    twin: TwinDevices | None = None
 
 
 def open_rig(config: Config, calibration: Calibration, ask: Callable[[str], str] = input) -> OpenRig:
@@ -95,7 +104,7 @@ def open_twin(config: Config, calibration: Calibration) -> OpenRig:
             scene,
             calibration,
             config.twin,
-            state=lambda: (firmware.bearing, lit_for_ever or firmware.laser_on),
+            state=lambda: (firmware.bearing, (lit_for_ever and not firmware.laser_dead) or firmware.laser_on),
             clock=lambda: firmware.now,
         )
         delayed = DelayedCamera(
@@ -114,6 +123,7 @@ def open_twin(config: Config, calibration: Calibration) -> OpenRig:
             lambda: firmware.now,
             opened.pop_all().close,
             Truth(scene, calibration, config.twin.laser),
+            TwinDevices(firmware, camera),
         )
     raise AssertionError("unreachable")
 

@@ -39,6 +39,15 @@ class SweepParams(BaseModel, frozen=True, extra="forbid"):
     settle_s: float = Field(0.15, ge=0.0, le=60.0, description="rest between arrival and exposure [s]")
     off_frames: bool = Field(False, description="also shoot each bearing with the laser off (Shot.background)")
     retries: int = Field(3, ge=0, le=100, description="how often a failed frame is taken again")
+    rehomings: int = Field(
+        2,
+        ge=0,
+        le=100,
+        description="how often a head with a switch or index mark is homed again after losing its place",
+    )
+    watch: bool = Field(
+        True, description="step, adaptive: notice lost steps, a stalled motor and a dead laser in the pictures"
+    )
     park: bool = Field(True, description="turn back to the first bearing at the end")
 
 

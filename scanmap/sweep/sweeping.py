@@ -8,26 +8,24 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanmap.errors import CameraError, ConfigError, ScanmapError
-from scanmap.rig import Camera, Frame, Rig, Streaming
+from scanmap.errors import ConfigError, ScanmapError
+from scanmap.rig import Rig
 from scanmap.shot import Shot
 from scanmap.sweep.planning import CABLE_LIMITS, Plan, SweepParams, plan
+from scanmap.sweep.stepping import Refine, Steps, grab
+from scanmap.sweep.watching import Watch
 
 HISTORY = 100  # reports kept for frames that arrive late
 SAMPLE_RAD = math.radians(0.02)  # how far off one report of a turning head may be
 
 logger = logging.getLogger(__name__)
-
-
-Refine = Callable[[], NDArray[np.float64]]  # further bearings [rad], asked for after an adaptive sweep's first pass
 
 
 @runtime_checkable
@@ -57,7 +55,8 @@ def sweep(
     *,
     clock: Callable[[], float] = time.monotonic,
     refine: Refine | None = None,
-    first: int = 0,
+    watch: Watch | None = None,
+    done: Collection[int] = (),
 ) -> Iterator[Shot]:
     """Shoot a rig around, bearing by bearing.
 
@@ -69,7 +68,8 @@ def sweep(
         sleep: waits for the head to settle; a twin in fast-forward passes time by its own clock.
         clock: the clock that frames are stamped with [s]; continuous sweeps ask the stage by it.
         refine: adaptive sweeps ask it for further bearings after the first pass.
-        first: index to begin with, for a sweep that was interrupted; not for continuous ones.
+        watch: holds the pictures against each other, to notice lost steps, a stalled motor and a dead laser.
+        done: indices of shots that an interrupted sweep took already; not for continuous ones.
 
     Yields:
         `Shot` with the bearing that the stage reported; time counts from the first frame.
@@ -77,7 +77,7 @@ def sweep(
     Raises:
         ConfigError: the plan leaves the stage's limits, or the stage cannot do the mode; nothing has moved.
         CameraError: no usable frame after all retries.
-        StageError: the stage failed.
+        StageError: the stage failed, or lost its place and cannot find it again by itself.
     """
     limits = rig.stage.limits if isinstance(rig.stage, Bounded) else CABLE_LIMITS
     planned = plan(params, limits)
@@ -85,7 +85,8 @@ def sweep(
         if not isinstance(rig.stage, Turning):
             raise ConfigError("sweep.mode = 'continuous' needs a stage of kind grbl: choose step or adaptive")
         return _guarded(rig, params, planned, _turn(rig, rig.stage, planned, stop, clock))
-    return _guarded(rig, params, planned, _step(rig, planned, stop, sleep, refine=refine, first=first))
+    steps = Steps(rig, planned, sleep, watch)
+    return _guarded(rig, params, planned, steps.shots(stop, refine, done))
 
 
 def _guarded(rig: Rig, params: SweepParams, planned: Plan, shots: Iterator[Shot]) -> Iterator[Shot]:
@@ -99,33 +100,6 @@ def _guarded(rig: Rig, params: SweepParams, planned: Plan, shots: Iterator[Shot]
         failed = False
     finally:
         _leave(rig, planned.bearings[0] if params.park else None, failed=failed)
-
-
-def _step(
-    rig: Rig,
-    planned: Plan,
-    stop: Callable[[], bool],
-    sleep: Callable[[float], None],
-    *,
-    refine: Refine | None,
-    first: int,
-) -> Iterator[Shot]:
-    """Stop, settle, shoot; then the same for what `refine` asks for, on the way back."""
-    bearings = planned.bearings.tolist()
-    index = first
-    while True:
-        while index < len(bearings) and not stop():
-            reported = rig.stage.move_to(bearings[index])
-            if planned.params.settle_s:
-                sleep(planned.params.settle_s)
-            frame, background = _take(rig, planned.params)
-            yield Shot(index, reported, bearings[index], frame.time, frame.image, background)
-            index += 1
-        if planned.params.mode != "adaptive" or refine is None or stop():
-            return
-        further = np.sort(refine())
-        refine = None
-        bearings += (further if bearings[-1] < bearings[0] else further[::-1]).tolist()
 
 
 def _turn(
@@ -146,7 +120,7 @@ def _turn(
         stage.start_turn(end, speed)
         last = -math.inf
         while abs(track[-1][1] - start) < abs(end - start) - 1e-4 and not stop():
-            frame = _grab(rig.camera, params.retries, moving=True)
+            frame = grab(rig.camera, params.retries, moving=True)
             track = [*track[-HISTORY:], _sample(rig, clock)]
             bearing = _steady_bearing(track, frame.time - params.latency_s, speed)
             if math.isnan(bearing) or abs(bearing - last) < math.radians(params.step_deg) * 0.99:
@@ -178,31 +152,6 @@ def _sample(rig: Rig, clock: Callable[[], float]) -> tuple[float, float]:
     before = clock()
     bearing = rig.stage.where()
     return (before + clock()) / 2, bearing
-
-
-def _take(rig: Rig, params: SweepParams) -> tuple[Frame, bytes | None]:
-    """A frame with the laser on and, if asked for and possible, one with it off, taken just before."""
-    background = None
-    if params.off_frames and rig.stage.laser_switchable:
-        rig.stage.laser(False)
-        background = _grab(rig.camera, params.retries).image
-    rig.stage.laser(True)
-    return _grab(rig.camera, params.retries), background
-
-
-def _grab(camera: Camera, retries: int, *, moving: bool = False) -> Frame:
-    take = camera.newest if moving and isinstance(camera, Streaming) else camera.grab
-    for attempt in range(retries + 1):
-        try:
-            return take()
-        except CameraError as error:
-            if attempt == retries:
-                raise CameraError(
-                    f"no usable frame after {attempt + 1} tries: {error}; check the camera's cable, or raise "
-                    "sweep.retries; `scanmap doctor` shows what it delivers"
-                ) from error
-            logger.warning("frame taken again (%d of %d): %s", attempt + 1, retries, error)
-    raise AssertionError("unreachable")
 
 
 def _leave(rig: Rig, park: float | None, *, failed: bool) -> None:

@@ -39,6 +39,7 @@ class Firmware:
     memory: Memory = field(default_factory=Memory)
     switch_deg: float | None = None  # true bearing of the limit switch
     index_deg: float | None = None  # true bearing of the index mark on the probe input
+    laser_dead: bool = False  # switched or not, it shines no more
 
     def __post_init__(self) -> None:
         self._lock = threading.RLock()
@@ -68,7 +69,7 @@ class Firmware:
         """Whether the laser shines at this moment."""
         with self._lock:
             self._live()
-            return self._executor.laser_power > 0
+            return self._executor.laser_power > 0 and not self.laser_dead
 
     @property
     def motor_on(self) -> bool:

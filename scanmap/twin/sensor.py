@@ -20,7 +20,6 @@ Coded = NDArray[np.int16]
 
 STEPS = 64  # of int16 per grey level
 TOP = 400  # [grey levels] the curve goes on above 255, so that noise does not pull saturated pixels down
-TILE_MARGIN = 64  # [px] by which the noise tile is larger than the picture
 
 
 class SensorParams(BaseModel, frozen=True, extra="forbid"):
@@ -55,9 +54,10 @@ class Sensor:
         self._linear = self._decoded(np.arange(TOP * STEPS + 1) / STEPS).astype(np.float32)
         self._sigma = self._noise_per_level()
         self._work = np.empty((height, width, 3), np.int16)
-        size = (height + TILE_MARGIN, width + TILE_MARGIN, 3) if params.noise else (0, 0, 3)
-        # Standard normal in 32nds. Shifted at random for every frame, it need not be drawn anew.
-        self._tile = np.clip(np.rint(rng.standard_normal(size, np.float32) * 32), -127, 127).astype(np.int8)
+        size = (height + 1) * width * 3 if params.noise else 0
+        # Standard normal in 32nds. Every row of a frame is cut out of it at random, so it need not be drawn anew; a
+        # whole picture cut out in one piece would let two frames be matched by their noise.
+        self._strip = np.clip(np.rint(rng.standard_normal(size, np.float32) * 32), -127, 127).astype(np.int8)
 
     def code(self, light: F32) -> Coded:
         """Light [fraction of saturation] to grey levels times STEPS, before noise; any shape."""
@@ -83,9 +83,10 @@ class Sensor:
         """One picture (H, W, 3) RGB with its noise, encoded; `rng` says which."""
         work = self._work
         if self._params.noise:
-            y, x = rng.integers(0, TILE_MARGIN, 2)
-            tile = self._tile[y : y + self._shape[0], x : x + self._shape[1]]
-            np.multiply(amplitude, tile, out=work, dtype=np.int16, casting="unsafe")
+            rows, columns = self._shape
+            starts = rng.integers(0, self._strip.size - 3 * columns + 1, rows)
+            noise = np.lib.stride_tricks.sliding_window_view(self._strip, 3 * columns)[starts]
+            np.multiply(amplitude, noise.reshape(rows, columns, 3), out=work, dtype=np.int16, casting="unsafe")
             np.right_shift(work, 3, out=work)
             np.add(work, coded, out=work)
             np.add(work, STEPS // 2, out=work)

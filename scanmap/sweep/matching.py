@@ -1,0 +1,116 @@
+"""How far two pictures of one head are turned against each other: what the room says of the bearing.
+
+The pictures are compared without the laser line, which turns with the head and says nothing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.errors import CameraError
+
+WIDTH = 400  # [px] pictures are made at most this wide
+LINE_PX = 12  # to either side of a row's brightest pixel, of the reduced picture
+BLUR_PX, BROAD_PX = 1.0, 8.0  # noise is finer than what is compared; a laser line narrower than its surroundings
+LINE_DN = 15.0  # [grey levels] by which a line stands out at least
+ELSEWHERE = 0.05  # share of the rows whose line may be elsewhere in pictures of one place: speckle, noise
+SURE = 9.0  # standard deviations; the highest of 10^5 values of pure noise reaches 5
+
+F32 = NDArray[np.float32]
+
+
+class Shift(NamedTuple):
+    """How far a picture has moved to the right against another."""
+
+    columns_px: float  # of the picture as it came
+    scale: float  # pixels of that picture in one of those compared
+    certainty: float  # height of the correlation's peak above its surroundings [standard deviations]
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the pictures show enough of the same to tell."""
+        return self.certainty >= SURE
+
+
+def shift_between(before: bytes, after: bytes) -> Shift:
+    """Shift of encoded picture `after` against `before`, by phase correlation (Kuglin and Hines 1975).
+
+    Raises:
+        CameraError: a picture cannot be decoded, or the two have different sizes.
+    """
+    (first, scale), (second, _) = _structure(before), _structure(after)
+    if first.shape != second.shape:
+        raise CameraError(f"pictures of {first.shape} and {second.shape} pixels cannot be compared")
+    a, b = np.fft.rfft2(first), np.fft.rfft2(second)
+    cross = b * np.conj(a)
+    size = np.abs(cross)
+    # Whitened, but frequencies that hold nothing but noise are not blown up to the others' size.
+    surface = np.fft.irfft2(cross / (size + size.mean()), first.shape)
+    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
+    spread = float(surface.std())
+    certainty = float((surface[row, column] - surface.mean()) / spread) if spread > 0 else 0.0
+    around = [float(surface[row, (column + k) % surface.shape[1]]) for k in (-1, 0, 1)]
+    bend = around[0] - 2.0 * around[1] + around[2]
+    place = column + (0.5 * (around[0] - around[2]) / bend if bend < 0 else 0.0)
+    wrapped = (place + surface.shape[1] / 2) % surface.shape[1] - surface.shape[1] / 2
+    return Shift(float(wrapped) * scale, scale, certainty)
+
+
+def same_line(before: bytes, after: bytes) -> bool:
+    """Whether two encoded pictures show the laser line, or whatever is brightest, in the same columns.
+
+    Raises:
+        CameraError: a picture cannot be decoded.
+    """
+    first, second = (_brightest(_small(image)[0]) for image in (before, after))
+    if first.shape != second.shape:
+        return False
+    seen = np.isfinite(first) & np.isfinite(second)
+    return bool(seen.any() and (np.abs(first - second)[seen] > 1.0).mean() < ELSEWHERE)
+
+
+def _structure(image: bytes) -> tuple[F32, float]:
+    """Edges and textures (h, w) of a picture, small and without the laser line; and how many pixels make one."""
+    small, scale = _small(image)
+    seen = 1.0 - _line(small).astype(np.float32)
+    blurred, weight = (cv2.GaussianBlur(v, (0, 0), BLUR_PX) for v in (small * seen, seen))
+    smooth = blurred / np.maximum(weight, 1e-3)
+    # Only what changes along the rows tells of a turn: a floor's edge looks the same from every bearing.
+    structure = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * cv2.erode(seen, np.ones((3, 5), np.uint8))
+    window = cv2.createHanningWindow(small.shape[::-1], cv2.CV_32F)
+    return np.asarray(structure * window, np.float32), scale
+
+
+def _line(small: F32) -> NDArray[np.bool_]:
+    """(h, w) where the brightest thing of each row is: the laser line, or a lamp, which is no loss."""
+    columns = np.arange(small.shape[1])
+    near: NDArray[np.bool_] = np.abs(columns - _sharp(small).argmax(axis=1)[:, None]) <= LINE_PX
+    return near
+
+
+def _brightest(small: F32) -> F32:
+    """(h,) column of the brightest thing of each row; NaN where nothing stands out."""
+    sharp = _sharp(small)
+    return np.where(sharp.max(axis=1) > LINE_DN, sharp.argmax(axis=1), np.nan).astype(np.float32)
+
+
+def _sharp(small: F32) -> F32:
+    return np.asarray(small - cv2.GaussianBlur(small, (0, 0), BROAD_PX), np.float32)
+
+
+def _small(image: bytes) -> tuple[F32, float]:
+    """A picture in grey, at most WIDTH wide, and how many of its pixels make one of these."""
+    data = np.frombuffer(image, np.uint8)
+    try:
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        grey = None
+    if grey is None:
+        raise CameraError(f"picture of {len(image)} bytes cannot be decoded")
+    scale = max(1.0, grey.shape[1] / WIDTH)
+    size = (round(grey.shape[1] / scale), round(grey.shape[0] / scale))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32), scale
