@@ -16,9 +16,10 @@ from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
 from scanmap.laserline.grey import SATURATED, Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
-from scanmap.laserline.path import by_width, columns_of_rows, windows
+from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool
+from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
 from scanmap.laserline.sight import Conversion, channel_of, sight_of
 
@@ -162,7 +163,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     widest = _CORE_SHARE * line.width_px[wide]
     line = _lost(line, wide, Reason.WIDE)
     if params.method == "gauss" and at[0].size:
-        y, _ = _samples(sight.plane, sight.lit, *at, _CORE_HALF)
+        y, _ = samples_of(sight.lit, sight.plane, *at).of(_CORE_HALF, slice(None))
         _take_cores(line, at, y.T, widest, noise, params)
     if sight.image is not None:
         line = _lost(line, strangers(line.column_px, sight.image, sight.channel), Reason.AMBIGUOUS)
@@ -186,15 +187,13 @@ def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: 
     row, column = at
     if not row.size:
         return line
-    # Speckle is one for the frame; the largest group tells it best.
+    around = samples_of(lit, plane, row, column)
+    # Speckle is one for the frame; the largest group, which comes first, tells it best.
     contrast = {"auto": None, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
-    for half, some in sorted(by_width(lit, row, column), key=lambda group: -len(group[1])):
-        if not some.size:
-            continue
+    for half, some in by_width(around.lit):
         r, c = row[some], column[some]
-        samples = partial(_samples, plane, lit, r, c)
-        y, usable = samples(half)
-        peaks = fit_gaussian(y, usable, noise, contrast, samples)
+        y, usable = around.of(half, some)
+        peaks = fit_gaussian(y, usable, noise, contrast, partial(around.of, some=some))
         contrast = peaks.contrast
         offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
@@ -214,17 +213,6 @@ def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: 
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]
     return line
-
-
-def _samples(seen: U8, lit: U8, row: Index, column: Index, half: int) -> tuple[F32, F32]:
-    """Samples (2 half + 1, N) of the line's light around each column, and 1 where they say more than "bright"."""
-    y = np.ascontiguousarray(windows(lit, row, column, half).T).astype(np.float32)
-    bright = y if lit is seen else windows(seen, row, column, half).T
-    usable = (bright < SATURATED).astype(np.float32)
-    if column.min() < half or column.max() >= lit.shape[1] - half:
-        x = column + np.arange(-half, half + 1)[:, None]
-        usable *= (x >= 0) & (x < lit.shape[1])
-    return y, usable
 
 
 def _take_cores(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, Candidates
@@ -20,15 +20,22 @@ _PATH_WORTH = 0.15  # what a pixel away from the path costs, squared, in the noi
 _CONTEXT = 6  # blocks on either side of a contested one that decide with it
 
 
-def windows(plane: U8, row: Index, column: Index, half: int) -> U8:
-    """Samples (N, 2 half + 1) around each column; the edge's own repeated outside the image."""
-    width = plane.shape[1]
-    if not row.size or (column.min() >= half and column.max() < width - half):
-        # Strided views copy whole runs of bytes, ten times the speed of picking samples one by one.
-        view = sliding_window_view(plane, 2 * half + 1, axis=1) if row.size else None
-        return np.empty((0, 2 * half + 1), np.uint8) if view is None else np.asarray(view[row, column - half])
-    x = np.clip(column[:, None] + np.arange(-half, half + 1), 0, width - 1)
-    return np.asarray(plane[row[:, None], x])
+def strips(plane: U8, row: Index, column: Index, half: int) -> U8:
+    """Samples (2 half + 1, N) around each column; the edge's own repeated outside the image.
+
+    Args:
+        plane: (H, W), or a view of one channel of a picture (H, W, 3).
+    """
+    width, apart = plane.shape[1], plane.strides[1]
+    if not row.size:
+        return np.empty((2 * half + 1, 0), np.uint8)
+    if column.min() < half or column.max() >= width - half:
+        x = np.clip(column[:, None] + np.arange(-half, half + 1), 0, width - 1)
+        return np.asarray(cv2.transpose(plane[row[:, None], x]), np.uint8)
+    # Whole runs of bytes, other channels with them, are copied at ten times the speed of picking samples one by one.
+    flat = as_strided(plane, (len(plane), apart * (width - 1) + 1), (plane.strides[0], 1), writeable=False)
+    runs = sliding_window_view(flat, apart * 2 * half + 1, axis=1)[row, apart * (column - half)]
+    return np.asarray(cv2.transpose(runs), np.uint8)[::apart]
 
 
 def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
@@ -79,42 +86,28 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
     return found, best[found]
 
 
-def by_width(lit: U8, row: Index, column: Index) -> list[tuple[int, Index]]:
-    """Rows sorted by how wide their line roughly is: (half width of the fit's window, indices)."""
-    reach = 24
-    y = np.ascontiguousarray(windows(lit, row, column, reach).T)
-    top = y[reach - 1 : reach + 2].sum(axis=0, dtype=np.uint16) // 3
-    # The brighter side counts: beside an edge of the room the run would never end at the darker one's level.
-    sides = np.maximum(y[4:12].sum(axis=0, dtype=np.uint16), y[-12:-4].sum(axis=0, dtype=np.uint16)) // 8
-    level = (np.minimum(sides, np.maximum(top, 2) - 2) + top) // 2
-    above = y > level.astype(np.uint8)
-    # Width of the run above half height that holds the middle.
-    left = np.logical_and.accumulate(above[reach::-1], axis=0).sum(axis=0)
-    right = np.logical_and.accumulate(above[reach:], axis=0).sum(axis=0)
-    full = left + right - 1
-    limits = ((8, 6), (13, 11), (24, 200))  # half window, largest full width at half height
-    found, lower = [], -2
-    for half, upper in limits:
-        found.append((half, np.flatnonzero((full > lower) & (full <= upper))))
-        lower = upper
-    return found
-
-
 def _stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:
     """The place within 5 px of `column` (N,) that stands out most, and by how much; 0 where column is NaN."""
-    reach, far = 5, 9
-    middle = np.rint(np.nan_to_num(column, nan=0.0)).astype(np.intp)
-    y = windows(plane, row, middle, reach + far)
+    reach, far, core = 5, 9, 5
+    known = ~np.isnan(column)
+    middle = np.rint(np.where(known, column, np.float32(0.0))).astype(np.intp)
+    y = strips(plane, row, middle, reach + far + core // 2).astype(np.int16)
     # Sums of five columns, one array row per column: every step below runs along the rows of the image.
-    smooth = np.asarray(cv2.blur(np.ascontiguousarray(y.T).astype(np.float32), (1, 5), borderType=cv2.BORDER_REPLICATE))
+    smooth = y[:-4] + y[1:-3]
+    smooth += y[2:-2]
+    smooth += y[3:-1]
+    smooth += y[4:]
     inner = smooth[far:-far]
     side = np.maximum(smooth[: -2 * far], smooth[2 * far :])
     # Noise moves the maximum of a dim line; the path is worth something too.
-    away = np.square(np.arange(-reach, reach + 1, dtype=np.float32))[:, None] * np.float32(_PATH_WORTH * noise)
-    at = (inner - np.float32(0.5) * side - away).argmax(axis=0)
+    away = np.square(np.arange(-reach, reach + 1))[:, None] * (2 * core * _PATH_WORTH * noise)
+    rank = 2 * inner - side - np.minimum(away, 1000.0).astype(np.int16)
+    # The place is packed below the rank, so that one maximum gives both: ten times the speed of argmax.
+    packed = rank.astype(np.int32) * 16 + np.arange(2 * reach, -1, -1, dtype=np.int32)[:, None]
+    at = 2 * reach - (packed.max(axis=0) & 15)
     index = np.arange(len(row))
-    response = np.where(np.isfinite(column), np.maximum(inner[at, index] - side[at, index], 1e-3), 0.0)
-    return middle - reach + at, response.astype(np.float32)
+    response = np.maximum((inner[at, index] - side[at, index]) * np.float32(1.0 / core), np.float32(1e-3))
+    return middle - reach + at, np.where(known, response, np.float32(0.0))
 
 
 def _best_path(column: F32, gain: F32) -> F32:

@@ -1,0 +1,73 @@
+"""The samples around each row's column, and how wide the line in them roughly is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline.grey import SATURATED
+from scanmap.laserline.path import strips
+
+F32 = NDArray[np.float32]
+I16 = NDArray[np.int16]
+U8 = NDArray[np.uint8]
+Index = NDArray[np.intp]
+
+REACH = 24  # [px] samples on either side of the column
+# Half of the fit's window, and the largest full width at half height it is for.
+_WINDOWS = ((8, 6), (13, 11), (REACH, 200))
+
+
+class Samples(NamedTuple):
+    """Samples of N rows around one column each, (2 REACH + 1, N): an image row is an array column."""
+
+    lit: U8  # of the laser's light
+    seen: U8  # of the picture, which says where it saturates
+    outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
+
+    def of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
+        """Samples (2 half + 1, n) of some rows, and 1 where they say more than "bright", else 0."""
+        span = slice(REACH - half, REACH + half + 1)
+        y = self.lit[span, some].astype(np.float32)
+        usable = self.seen[span, some] < SATURATED
+        if self.outside is not None:
+            usable &= ~self.outside[span, some]
+        return y, usable.astype(np.float32)
+
+
+def samples_of(lit: U8, seen: U8, row: Index, column: Index) -> Samples:
+    """The samples around integer columns (N,) of rows (N,); planes (H, W) of the laser's light and as seen."""
+    y = strips(lit, row, column, REACH)
+    bright = y if seen is lit else strips(seen, row, column, REACH)
+    outside = None
+    if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
+        x = column + np.arange(-REACH, REACH + 1)[:, None]
+        outside = (x < 0) | (x >= lit.shape[1])
+    return Samples(y, bright, outside)
+
+
+def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
+    """The rows of `Samples.lit` sorted by how wide their line roughly is, most rows first: (half window, rows)."""
+    top = (lit[REACH - 1].astype(np.int16) + lit[REACH] + lit[REACH + 1]) // 3
+    # The brighter side counts: beside an edge of the room the run would never end at the darker one's level.
+    sides = np.maximum(lit[4:12].sum(axis=0, dtype=np.int16), lit[-12:-4].sum(axis=0, dtype=np.int16)) >> 3
+    level = (np.minimum(sides, np.maximum(top, 2) - 2) + top) >> 1
+    above = (lit > level.astype(np.uint8)).view(np.uint8)
+    # Width of the run above half height that holds the middle: the first sample below it on either side.
+    distance = np.arange(REACH + 1, dtype=np.uint8)[:, None]
+    above = above * np.uint8(64)
+    left = np.minimum((above[REACH::-1] + distance).min(axis=0), REACH + 1).astype(np.int16)
+    right = np.minimum((above[REACH:] + distance).min(axis=0), REACH + 1)
+    full = left + right - 1
+    if full.max() <= _WINDOWS[0][1]:
+        return [(_WINDOWS[0][0], slice(None))]
+    found, lower = [], -2
+    for half, upper in _WINDOWS:
+        rows = np.flatnonzero((full > lower) & (full <= upper))
+        lower = upper
+        if rows.size:
+            found.append((half, rows))
+    return sorted(found, key=lambda group: -len(group[1]))
