@@ -19,6 +19,10 @@ _REACH = 3.2  # [sigma] samples farther from the line say nothing of it
 _ITERATIONS = 2
 _SPECKLE_REACH = 5.0  # [sigma] under speckle the flanks say more than the core
 _SPECKLE_ROWS = 31  # rows over which the line's height is smoothed for a first model of its speckle
+_OFF_MOST = 1.2  # [px] from the middle of the window, and
+_NARROW_PX, _WIDEST = 0.75, 6.2  # the widths, the wider as a part of the window, at which sums are integrals
+_DIM = 11.0  # heights, in noise, from whose first guess the way is too long for that
+_ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
 _CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
 _CURVED = 5.0  # how much, measured on dim lines: of (sigma_px / width_px)^2
 _FLANK_SHARE = 0.1  # of what the better flank says of u, at least from the other
@@ -62,46 +66,58 @@ def fit_gaussian(
     """
     n = len(y)
     x = (np.arange(n, dtype=np.float32) - n // 2)[:, None]
-    clipped = np.asarray(~usable[n // 2 - 1 : n // 2 + 2].all(axis=0))
-    # What is left of a clipped line needs more of its background to be told four parameters from.
-    least = np.where(clipped, np.float32(6.0), np.float32(3.0))
+    cut = np.flatnonzero(usable.min(axis=0) < 1)  # rows with samples that say little
+    clipped = np.zeros(y.shape[1], bool)
+    clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
     y = _levelled(y, x, sample_noise)
-    fit = _start(y, x)
-    for _ in range(_ITERATIONS + 2 * bool(clipped.any())):
-        fit = _improve(y, x, usable * _near(x, fit, _REACH, least), fit)
-    weight = usable * _near(x, fit, _REACH, least)
-    bell = _bell(x, fit)
-    residual = y - fit.b - fit.A * bell
+    fit = start = _start(y, x)
+    for _ in range(_ITERATIONS):
+        fit = _improve_whole(x, _Look(y, x, fit), fit)
+    odd = (np.abs(fit.u) > _OFF_MOST) | (fit.s < _NARROW_PX) | (fit.s > n / _WIDEST) | (_DIM * sample_noise > fit.A)
+    odd[cut] = True
+    part = np.flatnonzero(odd)
+    # What is left of a clipped line needs more of its background to be told four parameters from.
+    least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
+    if part.size:
+        fit = fit.with_rows(part, _fit_part(y[:, part], x, usable[:, part], start.of(part), least))
+    look = _Look(y, x, fit)
+    if part.size:
+        look.weight[:, part] = usable[:, part] * _near(x, fit.of(part), _REACH, least)
     if contrast is None:
-        contrast = _contrast(residual, fit.A * bell, weight, sample_noise)
+        contrast = _contrast(look.residual, fit.A * look.bell, look.weight, sample_noise)
     if contrast > SPECKLE_FROM:
         if samples is not None:
             y, usable = samples(n // 2 + n // 4)
             x = (np.arange(len(y), dtype=np.float32) - len(y) // 2)[:, None]
             y = _levelled(y, x, sample_noise)
         fit, weight = _fit_speckle(y, x, usable, fit, sample_noise, contrast)
-        bell = _bell(x, fit)
-        residual = y - fit.b - fit.A * bell
+        look = _Look(y, x, fit)
+        look.weight = weight
+    return _peaks(fit, look, clipped, cut, contrast)
+
+
+def _peaks(fit: _Fit, look: _Look, clipped: NDArray[np.bool_], cut: NDArray[np.intp], contrast: float) -> Peaks:
+    """What the fits say, and how well; `cut`: the rows some of whose samples say little."""
     # Of a saturated core the fit's height is a guess; that it rises to saturation is known.
     A = np.where(clipped, np.maximum(fit.A, SATURATED - fit.b), fit.A)
-    variance = _noise_variance(residual, weight)
+    variance = _noise_variance(look.residual, look.weight)
     # Cramer-Rao with the other three parameters unknown.
-    sigma = np.sqrt(variance / np.maximum(fit.information, 1e-6)) * fit.s / fit.A
+    sigma = np.sqrt(variance / np.maximum(fit.information, np.float32(1e-6))) * fit.s / fit.A
     # A and s are estimates too: what scatters them makes the bound itself too small by their variance.
-    sigma *= 1.0 + _CURVED * np.minimum(sigma / fit.s, 0.4) ** 2
-    z = (x - fit.u) / fit.s
-    slope = weight * bell * z
-    odd = slope * (z * z - np.float32(1.5))  # orthogonal to the derivative by u over the whole line
-    power = np.maximum(_dot(odd, odd), 1e-6)
-    asymmetry, uncertain = np.abs(_dot(odd, residual)) / power / A, np.sqrt(variance / power) / A
-    bias = 0.5 * fit.s * np.maximum(asymmetry - 0.05 - 2.5 * uncertain, 0.0)
+    sigma *= np.float32(1.0) + np.float32(_CURVED) * np.square(np.minimum(sigma / fit.s, np.float32(0.4)))
+    slope = look.slope
+    slope *= look.weight
+    odd = np.square(look.z)
+    odd -= np.float32(1.5)
+    odd *= slope  # orthogonal to the derivative by u over the whole line
+    power = np.maximum(_dot(odd, odd), np.float32(1e-6))
+    asymmetry, uncertain = np.abs(_dot(odd, look.residual)) / power / A, np.sqrt(variance / power) / A
+    bias = np.float32(0.5) * fit.s * np.maximum(asymmetry - np.float32(0.05) - np.float32(2.5) * uncertain, 0.0)
     one_sided = np.zeros(len(fit.u), bool)
-    cut = np.flatnonzero(~usable.all(axis=0))
     if cut.size:
         # What each flank adds to the knowledge of u.
         left, right = -np.minimum(slope[:, cut], 0.0).sum(axis=0), np.maximum(slope[:, cut], 0.0).sum(axis=0)
         one_sided[cut] = np.minimum(left, right) < _FLANK_SHARE * np.maximum(left, right)
-    sigma, A, bias = (values.astype(np.float32) for values in (sigma, A, bias))
     return Peaks(fit.u, sigma, fit.s, A, np.sqrt(variance), bias, contrast, clipped, one_sided)
 
 
@@ -114,6 +130,33 @@ class _Fit(NamedTuple):
     b: F32
     information: F32  # on u, in units of (A / s)^2 / noise^2
 
+    def of(self, rows: NDArray[np.intp]) -> _Fit:
+        """The fits of some rows."""
+        return _Fit(*(values[rows] for values in self))
+
+    def with_rows(self, rows: NDArray[np.intp], others: _Fit) -> _Fit:
+        """These fits, with those of some rows replaced."""
+        for values, other in zip(self, others, strict=True):
+            values[rows] = other
+        return self
+
+
+class _Look:
+    """What a fit leaves over in y (n, N), and where its samples count."""
+
+    def __init__(self, y: F32, x: F32, fit: _Fit) -> None:
+        self.z = x - fit.u
+        self.z *= np.float32(1.0) / fit.s
+        self.bell = np.square(self.z)
+        self.bell *= np.float32(-0.5)
+        np.exp(self.bell, out=self.bell)
+        self.slope = self.bell * self.z  # derivative by u, times s / A
+        self.residual = self.bell * -fit.A
+        self.residual += y
+        self.residual -= fit.b
+        reach = np.maximum(np.float32(_REACH), np.float32(3.0) / fit.s) + np.float32(0.5) / fit.s
+        self.weight = (np.abs(self.z) <= reach).astype(np.float32)
+
 
 def _levelled(y: F32, x: F32, sample_noise: float) -> F32:
     """Windows with the ramp between their two ends taken out, where it is more than noise.
@@ -121,28 +164,76 @@ def _levelled(y: F32, x: F32, sample_noise: float) -> F32:
     A line beside an edge of the room's own brightness would be fitted too wide. Everywhere else a ramp as a fifth
     parameter would cost a fifth of the accuracy.
     """
-    k = max(2, len(x) // 6)
-    left, right = y[:k].mean(axis=0), y[-k:].mean(axis=0)
+    left, right = _ends(y)
     ramp = right - left
     height = y.max(axis=0) - np.maximum(left, right)
-    ramp[np.abs(ramp) < np.maximum(4.5 * sample_noise * np.sqrt(2.0 / k), 0.3 * height)] = 0.0
-    if not ramp.any():
-        return y
-    levelled: F32 = y - ramp * (x / np.float32(len(x) - k))
-    return levelled
+    least = np.float32(4.5 * sample_noise * np.sqrt(2.0 / _end(y)))
+    steep = np.flatnonzero(np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height))
+    if steep.size:
+        y[:, steep] -= ramp[steep] * (x / np.float32(len(x) - _end(y)))
+    return y
+
+
+def _end(y: F32) -> int:
+    return max(2, len(y) // 6)
+
+
+def _ends(y: F32) -> tuple[F32, F32]:
+    """Means (N,) of the samples at the two ends of the windows."""
+    k = _end(y)
+    if k == 2:
+        return (y[0] + y[1]) * np.float32(0.5), (y[-1] + y[-2]) * np.float32(0.5)
+    return y[:k].mean(axis=0), y[-k:].mean(axis=0)
 
 
 def _start(y: F32, x: F32) -> _Fit:
     """First guess: background from the window's ends, width from area over height."""
-    k = max(2, len(x) // 6)
-    b = np.minimum(y[:k].mean(axis=0), y[-k:].mean(axis=0))
+    b = np.minimum(*_ends(y))
     above = y - b
-    A = np.maximum(above.max(axis=0), 1.0)
-    above *= above > 0.25 * A
+    A = np.maximum(above.max(axis=0), np.float32(1.0))
+    above *= above > np.float32(0.25) * A
     area = above.sum(axis=0)
-    u = np.clip(_dot(above, np.broadcast_to(x, y.shape)) / np.maximum(area, 1.0), -2.0, 2.0)
-    s = np.clip(area / A / np.float32(2.35), 0.7, 0.3 * len(x))
-    return _Fit(u.astype(np.float32), s.astype(np.float32), A, b, np.zeros_like(b))
+    u = np.clip((x[:, 0] @ above) / np.maximum(area, np.float32(1.0)), -2.0, 2.0)
+    s = np.clip(area / (A * np.float32(2.35)), np.float32(0.7), np.float32(0.3 * len(x)))
+    return _Fit(u, s, A, b, np.zeros_like(b))
+
+
+def _improve_whole(x: F32, look: _Look, fit: _Fit) -> _Fit:
+    """One step for rows with a whole line: the normal equations are those of the integrals over it.
+
+    Sums over samples of a smooth peak wider than 0.75 px are its integrals to a part in a hundred, and the odd ones
+    vanish, so that only the gradient is summed; what the matrix lacks costs convergence, not accuracy (the chord
+    method, Kantorovich).
+    """
+    wr = look.weight * look.residual
+    per_s = np.float32(1.0) / fit.s
+    level, bell, slope = wr.sum(axis=0) * per_s, _dot(wr, look.bell) * per_s, _dot(wr, look.slope) * per_s
+    wr *= look.slope
+    bent = _dot(wr, look.z) * per_s
+    count = look.weight.sum(axis=0) * per_s
+    # The level eliminated, then height and width; all per sigma.
+    k = np.float32(2.0 * np.pi) / count
+    share = level * np.float32(_ROOT_2PI) / count
+    bell -= share
+    bent -= share
+    aa, at, tt = np.float32(_ROOT_PI) - k, np.float32(0.5 * _ROOT_PI) - k, np.float32(0.75 * _ROOT_PI) - k
+    per_det = np.float32(1.0) / (aa * tt - at * at)
+    a, t = (tt * bell - at * bent) * per_det, (aa * bent - at * bell) * per_det
+    b = fit.b + (level - np.float32(_ROOT_2PI) * (a + t)) / count
+    p = slope * np.float32(2.0 / _ROOT_PI)
+    A = np.maximum(fit.A + a, np.float32(0.5))
+    per_A = np.float32(1.0) / A
+    half = np.float32(len(x) // 2)
+    u = np.clip(fit.u + np.clip(p * per_A, -1.0, 1.0) * fit.s, -half, half)
+    s = np.clip(fit.s * (np.float32(1.0) + np.clip(t * per_A, -0.4, 0.6)), SIGMA_MIN_PX, SIGMA_MAX_PX)
+    return _Fit(u, s, A, b, s * np.float32(0.5 * _ROOT_PI))
+
+
+def _fit_part(y: F32, x: F32, usable: F32, fit: _Fit, least: F32) -> _Fit:
+    """The fits (M,) of rows that lack samples, or whose sums are not the integrals."""
+    for _ in range(_ITERATIONS + 2 * bool((usable == 0).any())):
+        fit = _improve(y, x, usable * _near(x, fit, _REACH, least), fit)
+    return fit
 
 
 def _improve(y: F32, x: F32, weight: F32, fit: _Fit) -> _Fit:
