@@ -7,6 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 # How far two neighbouring rows' columns may differ beyond the line's own slope: in sigmas, and at least [px].
 _BREAK_SIGMA, _BREAK_PX = 6.0, 0.35
@@ -32,16 +33,17 @@ def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
     start, stop = _segments(column, sigma)
     pending = np.isfinite(column)
     for rows in (support, 5):
-        if rows > support:
+        if rows > support or rows > len(column):
             continue
-        fits = pending & (stop - start >= min(rows, 5))
-        at = np.flatnonzero(fits)
+        at = np.flatnonzero(pending & (stop - start >= rows))
         if not at.size:
             continue
-        fitted, spread, chi2 = _quadratic(column, sigma, at, start[at], stop[at], rows)
+        first = np.clip(at - rows // 2, start[at], stop[at] - rows)
+        fitted, spread, chi2 = _quadratic(column, sigma, at, first, rows)
         good = chi2 < _MISFIT
-        out_column[at[good]], out_sigma[at[good]] = fitted[good], spread[good]
-        pending[at[good]] = False
+        good_at = at[good]
+        out_column[good_at], out_sigma[good_at] = fitted[good], spread[good]
+        pending[good_at] = False
     return out_column, out_sigma
 
 
@@ -62,41 +64,41 @@ def _segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np
     return begins[number], begins[number + 1]
 
 
-def _quadratic(
-    column: Array, sigma: Array, at: NDArray[np.intp], start: NDArray[np.intp], stop: NDArray[np.intp], rows: int
-) -> tuple[Array, Array, Array]:
-    """Value at `at`, its sigma, and reduced chi^2 of the weighted quadratic over each row's window.
+def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) -> tuple[Array, Array, Array]:
+    """Value at rows `at` (N,), its sigma, and reduced chi^2 of the weighted quadratic over `rows` rows from `first`.
 
     Most surfaces are straight over so few rows, and a bend that is not there costs half of what pooling gains: it
     is shrunk by how far it stands out of its own uncertainty (James and Stein 1961).
     """
-    first = np.clip(at - rows // 2, start, np.maximum(stop - rows, start))
-    # One array row per row of support: every sum below runs along the rows of the image.
-    end = np.full(rows, np.nan)
-    base = column[at]
-    y = sliding_window_view(np.concatenate([column, end]), rows)[first].T - base
-    weight = 1.0 / np.maximum(sliding_window_view(np.concatenate([sigma, end]), rows)[first].T, 1e-4) ** 2
-    steps = first - at + np.arange(rows)[:, None]
-    if (stop - first).min() < rows:
-        outside = steps >= stop - at
-        y[outside] = weight[outside] = 0.0
-    t = steps * (2.0 / rows)
-    wt = weight * t
-    wtt = wt * t
-    m0, m1, m2 = weight.sum(axis=0), wt.sum(axis=0), wtt.sum(axis=0)
-    m3, m4 = (np.einsum("ij,ij->j", wtt, power) for power in (t, t * t))
-    r0, r1, r2 = (np.einsum("ij,ij->j", power, y) for power in (weight, wt, wtt))
+    known = np.isfinite(column)
+    weight = np.where(known, 1.0 / np.square(np.maximum(sigma, 1e-4)), 0.0)
+    # Near zero, so that nothing is lost where squares are subtracted.
+    base = np.median(column[known])
+    y = np.where(known, column - base, 0.0)
+    wy = weight * y
+    # All moments of all windows at once: one row of the picture after the other, times powers of its place.
+    t = (np.arange(rows) - rows // 2) * (2.0 / rows)
+    powers = t ** np.arange(5)[:, None]
+    m0, m1, m2, m3, m4 = powers @ sliding_window_view(weight, rows).T
+    r0, r1, r2 = powers[:3] @ sliding_window_view(wy, rows).T
+    q0 = np.convolve(wy * y, np.ones(rows), "valid")
     # The straight line first, then what the bend adds to it, orthogonal to it.
-    det = m0 * m2 - m1 * m1 + 1e-9 * m0 * m0
-    c0, c1 = (m2 * r0 - m1 * r1) / det, (m0 * r1 - m1 * r0) / det
-    b0, b1 = (m2 * m2 - m1 * m3) / det, (m0 * m3 - m1 * m2) / det  # of t^2 by the straight line
-    power = np.maximum(m4 - b0 * m2 - b1 * m3, 1e-9 * m0)
+    per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
+    c0, c1 = (m2 * r0 - m1 * r1) * per_det, (m0 * r1 - m1 * r0) * per_det
+    b0, b1 = (m2 * m2 - m1 * m3) * per_det, (m0 * m3 - m1 * m2) * per_det  # of t^2 by the straight line
+    power = np.maximum(m4 - b0 * m2 - b1 * m3, 1e-9 * m0 + 1e-30)
     bend = (r2 - c0 * m2 - c1 * m3) / power
     significance = bend * bend * power
     kept = significance / (significance + _BEND_DOUBT)
-    bend = bend * kept
-    value, variance = c0 - b0 * bend, m2 / det + b0 * b0 / power * (_BEND_LEAST + (1.0 - _BEND_LEAST) * kept)
-    residual = y - (c0 - b0 * bend) - t * (c1 - b1 * bend + t * bend)
-    freedom = np.maximum(np.minimum(stop - first, rows) - 3, 1)
-    chi2 = np.einsum("ij,ij->j", weight * residual, residual) / freedom
-    return base + value, np.sqrt(variance), chi2
+    # What the straight line leaves over, less what the kept part of the bend explains of it.
+    chi2 = (q0 - c0 * r0 - c1 * r1 - significance * (kept * (2.0 - kept))) / max(rows - 3, 1)
+    bend *= kept
+    spread = _BEND_LEAST + (1.0 - _BEND_LEAST) * kept
+    # Each row by the polynomial of its own window, which is centred on it except at a segment's ends.
+    tau = (at - first - rows // 2) * (2.0 / rows)
+    c0, c1, b0, b1, bend = c0[first], c1[first], b0[first], b1[first], bend[first]
+    off = tau * tau - b0 - b1 * tau
+    value = c0 + c1 * tau + bend * off
+    line = (m2[first] - 2.0 * tau * m1[first] + tau * tau * m0[first]) * per_det[first]
+    variance = line + off * off / power[first] * spread[first]
+    return base + value, np.sqrt(variance), chi2[first]
