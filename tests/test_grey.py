@@ -9,7 +9,8 @@ from synthetic_lines import GREEN, RED, LineSpec, clean, sensor
 
 from scanmap.errors import ConfigError
 from scanmap.laserline import LaserLineParams, binary_image, needs_colour, overlay, to_grey
-from scanmap.laserline.grey import laser_channel, without_background
+from scanmap.laserline.channel import laser_channel
+from scanmap.laserline.grey import without_background
 
 pictures = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9).map(lambda shape: (*shape, 3)))
 planes = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12))

@@ -19,6 +19,7 @@ Mask = NDArray[np.bool_]
 _COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
+_UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
@@ -55,7 +56,8 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     The laser's colour is measured from candidates that continue each other over several blocks, as the height of
     the line in the other channels over its height in its own: the light is of one colour, so whatever it falls on,
     that share stays, and nothing that hangs together is purer. A candidate is in doubt when another channel
-    rises above it by more than noise explains. Where its own channel is saturated, colour says nothing.
+    rises above it by more than noise explains. Where its own channel is saturated, colour says nothing,
+    and what shows the laser's is worth more.
     """
     doubt = np.ones_like(candidates.snr)
     block, which = np.nonzero(candidates.snr > 3.0)
@@ -75,7 +77,7 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     excess = other - (max(laser, 0.0) + 0.4) * own
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
     factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * own), 0.0, 1.0)
-    doubt[block, which] = np.where(saturated, 1.0, factor)
+    doubt[block, which] = np.where(saturated, _UNTOLD, factor)
     return doubt
 
 

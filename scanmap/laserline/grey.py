@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import cv2
@@ -11,6 +10,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from scanmap.errors import ConfigError
+from scanmap.laserline.channel import SATURATED, laser_channel
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -40,8 +40,6 @@ _WEIGHTS = {
     "luminance_709": (0.072169, 0.715160, 0.212671),
 }
 _YCRCB = {"ycbcr_y": 0, "ycbcr_cr": 1, "ycbcr_cb": 2}
-# Rows that the laser's colour is measured on.
-_COLOUR_ROWS = 32
 
 
 def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = None) -> U8:
@@ -74,59 +72,8 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
     raise ConfigError(f"grey conversion {grey!r}; valid: auto, bit_index, red, green, blue, mean, ...")
 
 
-def laser_channel(image: U8) -> int:
-    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour.
-
-    Measured on some rows: how far the best place rises above its sides in one channel more than in the
-    others, so that white things, however bright, do not vote; the better half of the rows counts. Where the core
-    saturates every channel alike, its flanks still have the laser's colour.
-    """
-    rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // _COLOUR_ROWS)])
-    planes = [np.asarray(plane, np.uint8) for plane in cv2.split(rows)]
-    blazing = _blazing_channel(planes)
-    if blazing is not None:
-        return blazing
-    away = max(9, len(image) // 96)
-    brightest = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
-    _, white = cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)
-    height = []
-    for plane in planes:
-        core = cv2.blur(plane, (3, 1))
-        padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
-        side = cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])
-        height.append(cv2.subtract(cv2.subtract(core, side), white))
-    best = [np.sort(cv2.subtract(height[c], cv2.max(height[c - 1], height[c - 2])).max(axis=1)) for c in range(3)]
-    strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
-    # A grey picture in three channels has no excess at all: then the brightest line counts.
-    if max(strength) <= 1.0:
-        strength = [float(plane.max(axis=1).mean()) for plane in height]
-    return int(np.argmax(strength))
-
-
-def _blazing_channel(planes: Sequence[U8]) -> int | None:
-    """The channel that is nearly saturated and alone in it, side by side, in a good part of the rows (n, W) of three.
-
-    On a near surface the line is a bar so wide that nothing of it is narrow in its own colour; what is narrow there
-    are the other channels. Nothing else in a room is as bright as that in one colour only.
-    """
-    share = [0.0, 0.0, 0.0]
-    for c in range(3):
-        some = np.flatnonzero(planes[c].max(axis=1) > _BLAZING)
-        if len(some) > _MANY * len(planes[c]):
-            plane, one, two = (np.ascontiguousarray(planes[k][some]) for k in (c, c - 1, c - 2))
-            _, alone = cv2.threshold(cv2.subtract(plane, cv2.max(one, two)), _ALONE, 255, cv2.THRESH_BINARY)
-            _, bright = cv2.threshold(plane, _BLAZING, 255, cv2.THRESH_BINARY)
-            run = np.asarray(cv2.erode(cv2.min(alone, bright), np.ones((1, 5), np.uint8)))
-            share[c] = np.count_nonzero(run.max(axis=1)) / len(planes[c])
-    best = int(np.argmax(share))
-    return best if share[best] > _MANY else None
-
-
 # What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
 PEDESTAL = 16
-SATURATED = 250  # [grey levels] from here on a sample says only "bright"
-_BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
-_MANY = 0.3  # share of the rows
 _ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
 
 

@@ -12,9 +12,10 @@ from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import find_bars
+from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
-from scanmap.laserline.grey import SATURATED, Grey, exposure_gain, to_grey
+from scanmap.laserline.grey import Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian

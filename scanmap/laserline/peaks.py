@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.grey import SATURATED
+from scanmap.laserline.channel import SATURATED
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

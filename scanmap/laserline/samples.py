@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.grey import SATURATED
+from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.path import strips
 
 F32 = NDArray[np.float32]

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, is_large, noise_of
+from scanmap.laserline.channel import laser_channel
 from scanmap.laserline.colour import without_colour
-from scanmap.laserline.grey import CHANNEL, Grey, extract, laser_channel, to_grey, without_background
+from scanmap.laserline.grey import CHANNEL, Grey, extract, to_grey, without_background
 
 U8 = NDArray[np.uint8]
 

@@ -1,0 +1,108 @@
+"""Which channel of a colour picture the laser shows in, judged from the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+U8 = NDArray[np.uint8]
+
+SATURATED = 250  # [grey levels] from here on a sample says only "bright"
+# Pairs of rows that the laser's colour is measured on: more where few do not tell; and what does, in grey levels.
+_COLOUR_PAIRS = (12, 32)
+_CLEAR_RATIO, _CLEAR = 2.5, 15.0
+_NARROW_PX, _BRIGHT_PX = (5, 160), (16, 40)  # distance of a line's sides: at least, and as a part of the width
+_BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
+_MANY = 0.3  # share of the rows
+
+
+def laser_channel(image: U8) -> int:
+    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour.
+
+    Measured on some pairs of rows: how far the best place rises above both its sides in the channel and in the
+    channel's lead over the other two, whichever is less, and in both rows; the better half of the pairs counts. So
+    neither white things vote, however bright, nor wide coloured ones, nor specks. Where the core saturates every
+    channel alike, its flanks still have the laser's colour and lend it theirs.
+    """
+    for pairs in _COLOUR_PAIRS:
+        step = max(1, len(image) // pairs)
+        rows = _planes(image[::step])
+        blazing = _blazing_channel(rows)
+        if blazing is not None:
+            return blazing
+        below = _planes(image[min(2, len(image) - 1) :: step])
+        upper, lower = (_by_colour([plane[: len(below[0])] for plane in part]) for part in (rows, below))
+        slack = np.ones((1, 5), np.uint8)
+        best = [np.sort(cv2.min(a, cv2.dilate(b, slack)).max(axis=1)) for a, b in zip(upper, lower, strict=True)]
+        strength = [float(rising[len(rising) // 2 :].mean()) for rising in best]
+        second, first = sorted(strength)[1:]
+        if first > max(_CLEAR_RATIO * second, _CLEAR):
+            break
+    # A grey picture in three channels has no lead at all: then the brightest line counts.
+    if first <= 1.0:
+        strength = [float(_ridge(plane, max(9, image.shape[1] // 96)).max(axis=1).mean()) for plane in rows]
+    return int(np.argmax(strength))
+
+
+def _planes(rows: U8) -> list[U8]:
+    return [np.asarray(plane, np.uint8) for plane in cv2.split(np.ascontiguousarray(rows))]
+
+
+def _by_colour(planes: Sequence[U8]) -> list[U8]:
+    """How far each place of some rows, (n, W) a channel, rises in a channel and in its lead over the others."""
+    brightest = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
+    white = np.asarray(cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    return [_rise(planes[c], cv2.max(planes[c - 1], planes[c - 2]), white) for c in range(3)]
+
+
+def _rise(own: U8, others: NDArray[np.generic], white: U8) -> U8:
+    """How far each place (n, W) rises in a channel and in its lead over the others, whichever is less."""
+    # The lead is halved to fit eight bits.
+    lead = np.asarray(cv2.addWeighted(own, 0.5, np.asarray(others, np.uint8), -0.5, 128.0), np.uint8)
+    width = own.shape[1]
+    rise = _lesser(own, lead, white, max(_NARROW_PX[0], width // _NARROW_PX[1]), 5)
+    clipped = np.asarray(cv2.threshold(own, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    if clipped.any():
+        # A saturated core may be wider than that.
+        away = max(_BRIGHT_PX[0], width // _BRIGHT_PX[1])
+        wide = cv2.min(_lesser(own, lead, white, away, 2 * away + 1), clipped)
+        rise = np.asarray(cv2.max(rise, wide), np.uint8)
+    return rise
+
+
+def _lesser(own: U8, lead: U8, white: U8, away: int, around: int) -> U8:
+    """The lesser rise (n, W) of a channel and of its lead, which white places are lent from `around` them."""
+    if white.any():
+        lent = cv2.dilate(cv2.subtract(lead, white), np.ones((1, around), np.uint8))
+        lead = np.asarray(cv2.copyTo(lent, white, lead.copy()), np.uint8)
+    half = _ridge(lead, away)
+    return np.asarray(cv2.min(cv2.add(half, half), _ridge(own, away)), np.uint8)
+
+
+def _ridge(plane: U8, away: int) -> U8:
+    """Mean of three columns less the brighter of those `away` columns to either side, at least 0."""
+    core = cv2.blur(plane, (3, 1))
+    padded = cv2.copyMakeBorder(core, 0, 0, away, away, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.subtract(core, cv2.max(padded[:, : -2 * away], padded[:, 2 * away :])), np.uint8)
+
+
+def _blazing_channel(planes: Sequence[U8]) -> int | None:
+    """The channel that is nearly saturated and alone in it, side by side, in a good part of the rows (n, W) of three.
+
+    On a near surface the line is a bar so wide that nothing of it is narrow in its own colour; what is narrow there
+    are the other channels. Nothing else in a room is as bright as that in one colour only.
+    """
+    share = [0.0, 0.0, 0.0]
+    for c in range(3):
+        some = np.flatnonzero(planes[c].max(axis=1) > _BLAZING)
+        if len(some) > _MANY * len(planes[c]):
+            plane, one, two = (np.ascontiguousarray(planes[k][some]) for k in (c, c - 1, c - 2))
+            _, alone = cv2.threshold(cv2.subtract(plane, cv2.max(one, two)), _ALONE, 255, cv2.THRESH_BINARY)
+            _, bright = cv2.threshold(plane, _BLAZING, 255, cv2.THRESH_BINARY)
+            run = np.asarray(cv2.erode(cv2.min(alone, bright), np.ones((1, 5), np.uint8)))
+            share[c] = np.count_nonzero(run.max(axis=1)) / len(planes[c])
+    best = int(np.argmax(share))
+    return best if share[best] > _MANY else None
