@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
-from scanmap.laserline.grey import flat
+from scanmap.laserline.grey import runs_of
 from scanmap.laserline.path import CONNECTED_PX
 
 F32 = NDArray[np.float32]
@@ -94,38 +93,37 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
     run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(column[row])) > 3.0))])
     middle = np.rint(column[row]).astype(np.intp)
     height, brightest = heights_of(image, row, middle)
-    # Sums over rows as differences of sums from the start: of the whole run, and of the rows nearby.
-    total = np.zeros((len(row) + 1, 4))
-    np.cumsum(height.T, axis=0, out=total[1:, :3])
-    np.cumsum(brightest[channel] >= COLOURLESS, out=total[1:, 3])
-    first, stop = np.searchsorted(run, run), np.searchsorted(run, run, side="right")
-    stranger = _in_other_channels(total, first, stop, channel)
+    clipped = brightest[channel] >= COLOURLESS
+    by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
+    stranger = _in_other_channels(by_run, np.bincount(run), channel)[run]
     if stranger.any():
+        # Sums over the rows nearby as differences of sums from the start.
+        total = np.zeros((4, len(row) + 1))
+        np.cumsum([*height, clipped], axis=1, out=total[:, 1:])
         index = np.arange(len(row))
-        stranger &= _in_other_channels(
-            total, np.maximum(index - _NEARBY, first), np.minimum(index + _NEARBY + 1, stop), channel
-        )
+        first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
+        stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
+        stranger &= _in_other_channels(total[:, stop] - total[:, first], stop - first, channel)
         lost[row[stranger]] = True
     return lost
+
+
+def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) -> Mask:
+    """Whether parts stand out in another channel; `total` (4, N): heights by channel, clipped rows; of `rows` (N,)."""
+    other = np.maximum(total[:3][channel - 1], total[:3][channel - 2])
+    in_other: Mask = (other > _STRANGER * total[channel]) & (total[3] < 0.3 * rows)
+    return in_other
 
 
 def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.int16]]:
     """Heights (3, N) above their sides of N places of a picture (H, W, 3), by channel, and their middles' samples."""
     length = 2 * _HALF + 1
     x = np.clip(column, _HALF, image.shape[1] - 1 - _HALF)
-    runs = sliding_window_view(flat(image), 3 * length, axis=1)[row, 3 * (x - _HALF)]
+    runs = runs_of(image, 3 * length)[row, 3 * (x - _HALF)]
     y = np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
     core = y[_HALF - 2] + y[_HALF - 1] + y[_HALF] + y[_HALF + 1] + y[_HALF + 2]
     side = y[0] + y[1] + y[-2] + y[-1]
     return core * np.float32(0.2) - side * np.float32(0.25), y[_HALF]
-
-
-def _in_other_channels(total: NDArray[np.float64], first: Index, stop: Index, channel: int) -> Mask:
-    """Whether rows `first` to `stop` (N,) stand out in another channel, of `total` heights and clipped rows."""
-    part = total[stop] - total[first]
-    other = np.delete(part[:, :3], channel, axis=1).max(axis=1)
-    in_other: Mask = (other > _STRANGER * part[:, channel]) & (part[:, 3] < 0.3 * (stop - first))
-    return in_other
 
 
 def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
@@ -134,7 +132,7 @@ def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
     row = np.minimum(block * BLOCK, height - BLOCK)
     x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
     length = 2 * _HALF + 1
-    view = sliding_window_view(flat(image), 3 * length, axis=1)
+    view = runs_of(image, 3 * length)
     first = view[row[:, None] + np.arange(BLOCK), 3 * (x - _HALF)[:, None]].reshape(-1, BLOCK, length, 3)
     total = first.sum(axis=1, dtype=np.uint16)
     core = total[:, _HALF - 2 : _HALF + 3]

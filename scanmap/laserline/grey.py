@@ -133,12 +133,18 @@ def extract(image: U8, channel: int) -> U8:
     return np.asarray(cv2.extractChannel(image, channel), np.uint8)
 
 
-def flat(image: U8) -> U8:
-    """An (H, W, 3) image's samples side by side, (H, 3 W), without a copy even of a part of a wider picture."""
-    height, width, channels = image.shape
-    if image.strides[1:] != (channels, 1):
-        return image.reshape(height, channels * width)
-    return as_strided(image, (height, channels * width), (image.strides[0], 1), writeable=False)
+def runs_of(image: U8, length: int) -> U8:
+    """Every run of `length` bytes side by side in each row (H, n, length), a view.
+
+    Args:
+        image: (H, W), (H, W, 3), or one channel of the latter, whose columns are three bytes apart.
+
+    A picture's runs are copied at ten times the speed of picking its samples one by one.
+    """
+    size = image.strides[1] * (image.shape[1] - 1) + (image.shape[2] if image.ndim == 3 else 1)
+    return as_strided(
+        image, (len(image), size - length + 1, length), (image.strides[0], 1, 1), subok=False, writeable=False
+    )
 
 
 def _bits(image: U8, n: int) -> U8:

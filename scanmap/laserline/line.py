@@ -136,6 +136,8 @@ def find_laser_line(
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
     """
+    if image.strides[1:] != (1, 1)[: image.ndim - 1] and image.strides[1:] != (image.shape[-1], 1):
+        image = np.ascontiguousarray(image)
     if window is None:
         window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
     if params.method == "brightest":

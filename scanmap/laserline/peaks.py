@@ -26,6 +26,7 @@ _ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
 _CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
 _CURVED = 5.0  # how much, measured on dim lines: of (sigma_px / width_px)^2
 _FLANK_SHARE = 0.1  # of what the better flank says of u, at least from the other
+_MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
 
@@ -316,18 +317,20 @@ def _noise_variance(residual: F32, weight: F32) -> F32:
 
     A row far worse than its neighbours (an edge, a second line) keeps its own.
     """
-    freedom = np.maximum((weight > 0).sum(axis=0) - 4.0, 1.0)
+    count = (weight > 0).view(np.uint8).sum(axis=0, dtype=np.uint8)
+    freedom = np.maximum(count.astype(np.float32) - np.float32(4.0), np.float32(1.0))
     own = _dot(weight * residual, residual) / freedom
-    count = -(-len(own) // _ROWS_POOLED)
-    filled = np.empty(count * _ROWS_POOLED, np.float32)
+    groups = -(-len(own) // _ROWS_POOLED)
+    filled = np.empty(groups * _ROWS_POOLED, np.float32)
     filled[: len(own)] = own
-    filled[len(own) :] = np.median(own[-_ROWS_POOLED:])
-    pooled = np.median(filled.reshape(count, _ROWS_POOLED), axis=1)
+    filled[len(own) :] = np.sort(own[-_ROWS_POOLED:])[len(own[-_ROWS_POOLED:]) // 2] if len(own) else 0.0
+    ordered = np.sort(filled.reshape(groups, _ROWS_POOLED), axis=1)
     # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
-    k = float(np.median(freedom)) if len(own) else 1.0
-    common = np.repeat(pooled, _ROWS_POOLED)[: len(own)] / (1.0 - 2.0 / (9.0 * k)) ** 3
-    limit = 1.0 + 4.0 * np.sqrt(2.0 / freedom)
-    variance: F32 = np.maximum(np.where(own > limit * common, own, common), 1.0 / 12.0).astype(np.float32)
+    k = float(freedom.mean()) if len(own) else 1.0
+    middle = ordered[:, _ROWS_POOLED // 2 - 1] + ordered[:, _ROWS_POOLED // 2]
+    common = np.repeat(middle * np.float32(0.5 / (1.0 - 2.0 / (9.0 * k)) ** 3), _ROWS_POOLED)[: len(own)]
+    limit = np.float32(1.0) + np.sqrt(np.float32(32.0) / freedom)
+    variance: F32 = np.maximum(np.where(own > limit * common, own, common), np.float32(1.0 / 12.0))
     return variance
 
 
@@ -336,6 +339,11 @@ def _contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> f
 
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
+    quick = slice(None, None, max(1, residual.shape[1] // 128))
+    weights, left = weight[:, quick], residual[:, quick]
+    own = np.sort(_dot(weights * left, left) / np.maximum(weights.sum(axis=0) - 4.0, 1.0))
+    if not len(own) or own[len(own) // 2] < _MORE_SCATTER * sample_noise**2:
+        return 0.0
     stride = max(1, residual.shape[1] // 400)
     pairs = [(values[:, 1::stride], values[:, :-1:stride]) for values in (residual, signal, weight)]
     step = pairs[0][0] - pairs[0][1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -73,14 +73,14 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     known = np.isfinite(column)
     weight = np.where(known, 1.0 / np.square(np.maximum(sigma, 1e-4)), 0.0)
     # Near zero, so that nothing is lost where squares are subtracted.
-    base = np.median(column[known])
+    base = column[known].mean()
     y = np.where(known, column - base, 0.0)
     wy = weight * y
     # All moments of all windows at once: one row of the picture after the other, times powers of its place.
     t = (np.arange(rows) - rows // 2) * (2.0 / rows)
     powers = t ** np.arange(5)[:, None]
-    m0, m1, m2, m3, m4 = powers @ sliding_window_view(weight, rows).T
-    r0, r1, r2 = powers[:3] @ sliding_window_view(wy, rows).T
+    m0, m1, m2, m3, m4 = powers @ _windows(weight, rows)
+    r0, r1, r2 = powers[:3] @ _windows(wy, rows)
     q0 = np.convolve(wy * y, np.ones(rows), "valid")
     # The straight line first, then what the bend adds to it, orthogonal to it.
     per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
@@ -102,3 +102,9 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     line = (m2[first] - 2.0 * tau * m1[first] + tau * tau * m0[first]) * per_det[first]
     variance = line + off * off / power[first] * spread[first]
     return base + value, np.sqrt(variance), chi2[first]
+
+
+def _windows(values: Array, rows: int) -> Array:
+    """All windows of so many values (rows, H - rows + 1), a view."""
+    step = values.strides[0]
+    return as_strided(values, (rows, len(values) - rows + 1), (step, step), writeable=False)
