@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, look, scanning, settings, terminal
+from scanmap.cli import calibrating, look, scanning, settings, tabling, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -30,6 +30,7 @@ app.command()(look.view)
 app.command("map")(look.make_map)
 app.command()(look.info)
 app.command()(settings.config)
+calibrating.calibrate.command()(tabling.table)
 app.add_typer(calibrating.calibrate)
 
 
