@@ -19,6 +19,7 @@ _COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much ha
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
 _UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
+_MOSTLY = 0.75  # share of a run's rows
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
@@ -44,13 +45,14 @@ def without_colour(image: U8) -> bool:
     return bool(np.abs(np.diff(coarse, axis=2)).mean() < 1.0)
 
 
-def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) -> F32:
+def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, shares: F32) -> F32:
     """Factors (B, COUNT) for the candidates' scores: 1 for the laser's colour, down to 0 for another.
 
     Args:
         image: (H, W, 3).
         channel: the laser's own.
         noise: standard deviation of a sample [grey levels].
+        shares: (B,) of the first candidates that are beyond doubt, NaN where they are not.
 
     The laser's colour is measured from candidates that continue each other over several blocks, as the height of
     the line in the other channels over its height in its own: the light is of one colour, so whatever it falls on,
@@ -59,7 +61,7 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     and what shows the laser's is worth more.
     """
     doubt = np.ones_like(candidates.snr)
-    block, which = np.nonzero(candidates.snr > 3.0)
+    block, which = np.nonzero((candidates.snr > 3.0) & np.isnan(shares)[:, None])
     if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
         return doubt
     height, brightest = _heights(image, block, candidates.column[block, which])
@@ -68,6 +70,7 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     saturated = brightest[:, channel] >= COLOURLESS
     share = np.full(candidates.snr.shape, np.nan, np.float32)
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
+    share[:, 0] = shares
     share[block, which] = other / own
     laser = _laser_share(candidates, share)
     if laser is None or laser > _COLOURLESS_SHARE:
@@ -80,8 +83,14 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float) 
     return doubt
 
 
-def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
+def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) -> Mask:
     """Rows (H,) in runs that stand out in another channel nearly as much as in the laser's own.
+
+    Args:
+        column: (H,) of the line, NaN where none.
+        image: (H, W, 3).
+        channel: the laser's own.
+        pure: (H,) rows known to be of its colour; a run of mostly such is not asked.
 
     Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
     parts are asked. Where the core saturates they say nothing.
@@ -91,6 +100,10 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int) -> Mask:
     if not row.size or image.shape[1] <= 2 * _HALF:
         return lost
     run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(column[row])) > 3.0))])
+    doubtful = (np.bincount(run, pure[row]) < _MOSTLY * np.bincount(run))[run]
+    if not doubtful.any():
+        return lost
+    row, run = row[doubtful], run[doubtful]
     middle = np.rint(column[row]).astype(np.intp)
     height, brightest = heights_of(image, row, middle)
     clipped = brightest[channel] >= COLOURLESS

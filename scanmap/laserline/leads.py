@@ -88,23 +88,29 @@ def settled(leads: Leads, noise: float, min_snr: float) -> Mask:
     return good
 
 
-def of_one_colour(rows: U8, leads: Leads, channel: int, good: Mask) -> Mask:
-    """Those of the `good` blocks (B,) whose lead is as pure as any laser or too bright to have a colour.
+def shares_of(rows: U8, leads: Leads, channel: int, good: Mask) -> F32:
+    """Height of the leads in the other channels over their own (B,); NaN where a lead may be of another colour.
 
     Args:
         rows: (B, W, 3) BGR, one row of each block.
+        channel: the laser's own.
+        good: (B,) the leads in question.
+
+    As pure as any laser is, or too bright to have a colour.
     """
     block = np.flatnonzero(good)
-    pure = np.zeros(len(rows), bool)
+    shares = np.full(len(rows), np.nan, np.float32)
     if not block.size:
-        return pure
+        return shares
     height, middle = heights_of(rows, block, np.rint(leads.column[block]).astype(np.intp))
     own, other = height[channel], np.maximum(height[channel - 1], height[channel - 2])
     saturated = middle[channel] >= COLOURLESS
     # The mean over neighbours on the same line is known far better than one row's.
-    share = cv2.blur(np.stack([other, own]), (5, 1), borderType=cv2.BORDER_REPLICATE)
-    pure[block] = saturated | ((other < _PURE * own) | (share[0] < 0.9 * _PURE * share[1]))
-    return pure
+    smooth = cv2.blur(np.stack([other, own]), (5, 1), borderType=cv2.BORDER_REPLICATE)
+    share = smooth[0] / np.maximum(smooth[1], np.float32(1.0))
+    pure = saturated | (other < _PURE * own) | (share < 0.9 * _PURE)
+    shares[block[pure]] = share[pure]
+    return shares
 
 
 def _halved(values: U8 | U16) -> U16:

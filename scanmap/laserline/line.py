@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import find_bars
+from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
@@ -157,7 +158,8 @@ def find_laser_line(
 def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Array) -> LaserLine:
     sight = sight_of(image, background, Conversion(params.grey, params.bit_index, params.off_threshold))
     noise = sight.noise
-    row, column = columns_of_rows(sight.lit, search(sight, window, params.min_snr), window, noise)
+    course = search(sight, window, params.min_snr)
+    row, column = columns_of_rows(sight.lit, course.column, window, noise)
     line = _located(sight.plane, sight.lit, (row, column), noise, params)
     _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
     line = _within(line, window)
@@ -169,7 +171,8 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
         y, _ = samples_of(sight.lit, sight.plane, *at).of(_CORE_HALF, slice(None))
         _take_cores(line, at, y.T, widest, noise, params)
     if sight.image is not None:
-        line = _lost(line, strangers(line.column_px, sight.image, sight.channel), Reason.AMBIGUOUS)
+        pure = np.repeat(course.pure, BLOCK)[: len(image)]
+        line = _lost(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
     line = _lost(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:

@@ -79,9 +79,12 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     # All moments of all windows at once: one row of the picture after the other, times powers of its place.
     t = (np.arange(rows) - rows // 2) * (2.0 / rows)
     powers = t ** np.arange(5)[:, None]
-    m0, m1, m2, m3, m4 = powers @ _windows(weight, rows)
-    r0, r1, r2 = powers[:3] @ _windows(wy, rows)
-    q0 = np.convolve(wy * y, np.ones(rows), "valid")
+    # A window for every row of the picture, or only those asked for.
+    few = 4 * len(at) < len(column)
+    asked: Index | slice = first if few else slice(None)
+    m0, m1, m2, m3, m4 = powers @ _windows(weight, rows)[:, asked]
+    r0, r1, r2 = powers[:3] @ _windows(wy, rows)[:, asked]
+    q0 = _windows(wy * y, rows)[:, asked].sum(axis=0)
     # The straight line first, then what the bend adds to it, orthogonal to it.
     per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
     c0, c1 = (m2 * r0 - m1 * r1) * per_det, (m0 * r1 - m1 * r0) * per_det
@@ -96,12 +99,13 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     spread = _BEND_LEAST + (1.0 - _BEND_LEAST) * kept
     # Each row by the polynomial of its own window, which is centred on it except at a segment's ends.
     tau = (at - first - rows // 2) * (2.0 / rows)
-    c0, c1, b0, b1, bend = c0[first], c1[first], b0[first], b1[first], bend[first]
+    own = np.arange(len(at)) if few else first
+    c0, c1, b0, b1, bend = c0[own], c1[own], b0[own], b1[own], bend[own]
     off = tau * tau - b0 - b1 * tau
     value = c0 + c1 * tau + bend * off
-    line = (m2[first] - 2.0 * tau * m1[first] + tau * tau * m0[first]) * per_det[first]
-    variance = line + off * off / power[first] * spread[first]
-    return base + value, np.sqrt(variance), chi2[first]
+    line = (m2[own] - 2.0 * tau * m1[own] + tau * tau * m0[own]) * per_det[own]
+    variance = line + off * off / power[own] * spread[own]
+    return base + value, np.sqrt(variance), chi2[own]
 
 
 def _windows(values: Array, rows: int) -> Array:

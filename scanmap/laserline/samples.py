@@ -20,6 +20,8 @@ REACH = 24  # [px] samples on either side of the column
 # Half of the fit's window, and the largest full width at half height it is for.
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
+_FEW = 24  # rows
+
 
 class Samples(NamedTuple):
     """Samples of N rows around one column each, (2 REACH + 1, N): an image row is an array column."""
@@ -64,8 +66,10 @@ def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
     full = left + right - 1
     if full.max() <= _WINDOWS[0][1]:
         return [(_WINDOWS[0][0], slice(None))]
+    # A few wide ones are fitted together.
+    few = np.count_nonzero(full > _WINDOWS[0][1]) < _FEW and full.max() > _WINDOWS[1][1]
     found, lower = [], -2
-    for half, upper in _WINDOWS:
+    for half, upper in (_WINDOWS[0], _WINDOWS[-1]) if few else _WINDOWS:
         rows = np.flatnonzero((full > lower) & (full <= upper))
         lower = upper
         if rows.size:

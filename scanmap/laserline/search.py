@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,17 +18,25 @@ from scanmap.laserline.candidates import (
 )
 from scanmap.laserline.colour import blocks_of, colour_doubt
 from scanmap.laserline.grey import NEIGHBOUR, extract
-from scanmap.laserline.leads import find_leads, of_one_colour, settled
+from scanmap.laserline.leads import find_leads, settled, shares_of
 from scanmap.laserline.path import choose_path
 from scanmap.laserline.sight import Sight, second_rows
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
-def search(sight: Sight, window: F64, min_snr: float) -> F32:
-    """The line's column (B,) in each block of rows, NaN where there is none.
+class Course(NamedTuple):
+    """Where the line runs through B blocks of rows, arrays (B,)."""
+
+    column: F32  # [px] NaN where there is none
+    pure: Mask  # of the laser's colour beyond doubt
+
+
+def search(sight: Sight, window: F64, min_snr: float) -> Course:
+    """The line's column in each block of rows.
 
     Args:
         window: (H, 2) first and last column of each row, NaN where a row can have no line.
@@ -35,17 +45,20 @@ def search(sight: Sight, window: F64, min_snr: float) -> F32:
     if not is_large(sight.lit):
         other = None if sight.image is None else blocks_of(sight.image, NEIGHBOUR[sight.channel])
         found = find_candidates(sight.lit, window, sight.noise, min_snr, other)
-        return choose_path(found, _scores(sight, found), min_snr)
+        path = choose_path(found, _scores(sight, found, np.full(len(found.snr), np.nan, np.float32)), min_snr)
+        return Course(path, np.zeros(len(path), bool))
     leads = find_leads(sight.rows, block_window(window))
-    good = settled(leads, sight.noise, min_snr)
+    good, shares = settled(leads, sight.noise, min_snr), np.full(len(leads.column), np.nan, np.float32)
     if sight.image is not None:
-        good = of_one_colour(second_rows(sight.image), leads, sight.channel, good)
-    found = Candidates(leads.column[:, None], np.where(good, leads.height / unit_of(sight.noise, True), 0.0)[:, None])
+        shares = shares_of(second_rows(sight.image), leads, sight.channel, good)
+        good = ~np.isnan(shares)
+    snr = np.where(good, leads.height / np.float32(unit_of(sight.noise, True)), np.float32(0.0))
+    found = Candidates(leads.column[:, None], snr[:, None])
     rest = np.flatnonzero(~good)
     if not rest.size:
-        return choose_path(found, found.snr, min_snr)
+        return Course(choose_path(found, found.snr, min_snr), good)
     found = _with_blocks(found, rest, _all_candidates(sight, rest, window, min_snr))
-    return choose_path(found, _scores(sight, found), min_snr)
+    return Course(choose_path(found, _scores(sight, found, shares), min_snr), good)
 
 
 def _all_candidates(sight: Sight, blocks: Index, window: F64, min_snr: float) -> Candidates:
@@ -67,7 +80,8 @@ def _with_blocks(found: Candidates, blocks: Index, more: Candidates) -> Candidat
     return Candidates(column, snr)
 
 
-def _scores(sight: Sight, found: Candidates) -> F32:
+def _scores(sight: Sight, found: Candidates, shares: F32) -> F32:
+    """The candidates' worth (B, n): their signal to noise, less where the colour is in doubt."""
     if sight.image is None:
         return found.snr
-    return found.snr * colour_doubt(sight.image, sight.channel, found, sight.noise)
+    return found.snr * colour_doubt(sight.image, sight.channel, found, sight.noise, shares)
