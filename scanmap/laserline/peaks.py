@@ -344,7 +344,7 @@ def _contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> f
     own = np.sort(_dot(weights * left, left) / np.maximum(weights.sum(axis=0) - 4.0, 1.0))
     if not len(own) or own[len(own) // 2] < _MORE_SCATTER * sample_noise**2:
         return 0.0
-    stride = max(1, residual.shape[1] // 400)
+    stride = max(1, residual.shape[1] // 300)
     pairs = [(values[:, 1::stride], values[:, :-1:stride]) for values in (residual, signal, weight)]
     step = pairs[0][0] - pairs[0][1]
     level = np.minimum(*pairs[1])

@@ -82,8 +82,8 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     # A window for every row of the picture, or only those asked for.
     few = 4 * len(at) < len(column)
     asked: Index | slice = first if few else slice(None)
-    m0, m1, m2, m3, m4 = powers @ _windows(weight, rows)[:, asked]
-    r0, r1, r2 = powers[:3] @ _windows(wy, rows)[:, asked]
+    m0, m1, m2, m3, m4 = powers @ np.ascontiguousarray(_windows(weight, rows)[:, asked])
+    r0, r1, r2 = powers[:3] @ np.ascontiguousarray(_windows(wy, rows)[:, asked])
     q0 = _windows(wy * y, rows)[:, asked].sum(axis=0)
     # The straight line first, then what the bend adds to it, orthogonal to it.
     per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
