@@ -1,4 +1,4 @@
-"""The quick look: one row of each block tells where the line is, unless something there comes near it."""
+"""The quick look: a row of every other block tells where the line is, unless something there comes near it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import COLOURLESS
 from scanmap.laserline.colour import heights_of
-from scanmap.laserline.path import CONNECTED_PX, JUMP
+from scanmap.laserline.path import JUMP
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -26,10 +26,11 @@ _LEAST_SNR = 12.0  # of a lead that is believed
 _SETTLED = 2.0  # how far a chain's leads are ahead of their rivals, in costs of a jump there and back
 _PURE = 0.4  # share of a line's height in other channels that no laser is doubted for
 _LEAST_BLOCKS = 3
+STEEP_PX = 12.0  # a line that runs farther from one lead to the next is left to the path
 
 
 class Leads(NamedTuple):
-    """The best place of each of B blocks, arrays (B,)."""
+    """The best place of each of N rows, arrays (N,)."""
 
     column: F32  # [px] to a pixel or two
     height: F32  # over the brighter of its two sides [grey levels]
@@ -40,7 +41,7 @@ def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
     """The best place of each block, and the next best at two resolutions.
 
     Args:
-        rows: (B, W) one row of each block.
+        rows: (N, W) one row of every other block.
         limits: first and last column (B,) that a block's line can have, NaN where it can have none.
     """
     sums, scale = _halved(rows), 2
@@ -80,7 +81,7 @@ def settled(leads: Leads, noise: float, min_snr: float) -> Mask:
     unit = 1.35 * max(noise, 1.2) / np.sqrt(2.0 * _CENTRE)
     believed = (leads.height > _LEAST_SNR * unit) & (leads.height > leads.rival)
     ahead = np.log(np.maximum(leads.height, 1e-3) / np.maximum(leads.rival, min_snr * unit))
-    linked = believed[1:] & believed[:-1] & (np.abs(np.diff(leads.column)) <= CONNECTED_PX)
+    linked = believed[1:] & believed[:-1] & (np.abs(np.diff(leads.column)) <= STEEP_PX)
     chain = np.concatenate([[0], np.cumsum(~linked)])
     long = np.bincount(chain) >= _LEAST_BLOCKS
     won = np.bincount(chain, ahead) > _SETTLED * JUMP
@@ -92,7 +93,7 @@ def shares_of(rows: U8, leads: Leads, channel: int, good: Mask) -> F32:
     """Height of the leads in the other channels over their own (B,); NaN where a lead may be of another colour.
 
     Args:
-        rows: (B, W, 3) BGR, one row of each block.
+        rows: (B, W, 3) BGR, one row of every other block.
         channel: the laser's own.
         good: (B,) the leads in question.
 

@@ -71,20 +71,20 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
     slope = np.zeros(len(path), np.float32)
     slope[1:-1] = np.where(smooth[1:] & smooth[:-1], 0.5 * (step[1:] + step[:-1]), 0.0) / BLOCK
     own = path[block] + slope[block] * (row % BLOCK - np.float32(0.5 * (BLOCK - 1)))
-    best, height_of_best = _stand_out(plane, row, own, noise)
+    best, height_of_best = stand_out(plane, row, own, noise)
     jumpy = ~np.concatenate([[True], smooth, [True]])
     at = np.flatnonzero((jumpy[1:] | jumpy[:-1])[block])
     if at.size:
         padded = np.concatenate([[np.nan], path, [np.nan]])
         for neighbour in (padded[:-2], padded[2:]):
-            rival, response = _stand_out(plane, at, neighbour[block[at]], noise)
+            rival, response = stand_out(plane, at, neighbour[block[at]], noise)
             better = response > height_of_best[at] * 1.05
             best[at[better]], height_of_best[at[better]] = rival[better], response[better]
     found = np.flatnonzero((height_of_best > 0) & np.isfinite(window[:, 0]))
     return found, best[found]
 
 
-def _stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:
+def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:
     """The place within 5 px of `column` (N,) that stands out most, and by how much; 0 where column is NaN."""
     reach, far, core = 5, 9, 5
     known = ~np.isnan(column)

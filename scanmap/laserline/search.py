@@ -18,14 +18,16 @@ from scanmap.laserline.candidates import (
 )
 from scanmap.laserline.colour import blocks_of, colour_doubt
 from scanmap.laserline.grey import NEIGHBOUR, extract
-from scanmap.laserline.leads import find_leads, settled, shares_of
-from scanmap.laserline.path import choose_path
-from scanmap.laserline.sight import Sight, second_rows
+from scanmap.laserline.leads import STEEP_PX, find_leads, settled, shares_of
+from scanmap.laserline.path import choose_path, stand_out
+from scanmap.laserline.sight import Sight, quick_rows
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+
+_GOES_ON = 0.5  # least height of a line between two places, over the lesser of theirs
 
 
 class Course(NamedTuple):
@@ -47,18 +49,42 @@ def search(sight: Sight, window: F64, min_snr: float) -> Course:
         found = find_candidates(sight.lit, window, sight.noise, min_snr, other)
         path = choose_path(found, _scores(sight, found, np.full(len(found.snr), np.nan, np.float32)), min_snr)
         return Course(path, np.zeros(len(path), bool))
-    leads = find_leads(sight.rows, block_window(window))
-    good, shares = settled(leads, sight.noise, min_snr), np.full(len(leads.column), np.nan, np.float32)
-    if sight.image is not None:
-        shares = shares_of(second_rows(sight.image), leads, sight.channel, good)
-        good = ~np.isnan(shares)
-    snr = np.where(good, leads.height / np.float32(unit_of(sight.noise, True)), np.float32(0.0))
-    found = Candidates(leads.column[:, None], snr[:, None])
+    found, shares = _settled(sight, window, min_snr)
+    good = found.snr[:, 0] > 0
     rest = np.flatnonzero(~good)
     if not rest.size:
         return Course(choose_path(found, found.snr, min_snr), good)
     found = _with_blocks(found, rest, _all_candidates(sight, rest, window, min_snr))
     return Course(choose_path(found, _scores(sight, found, shares), min_snr), good)
+
+
+def _settled(sight: Sight, window: F64, min_snr: float) -> tuple[Candidates, F32]:
+    """The only candidate (B, 1) of each block that a quick look settles, and its share in other channels (B,).
+
+    A row of every other block is looked at; in the blocks between, the line must go on as high.
+    """
+    limits = block_window(window)
+    leads = find_leads(sight.rows, (limits[0][::2], limits[1][::2]))
+    good = settled(leads, sight.noise, min_snr)
+    known = np.zeros(len(good), np.float32)
+    if sight.image is not None:
+        known = shares_of(quick_rows(sight.image), leads, sight.channel, good)
+        good = ~np.isnan(known)
+    column, height, shares = (np.zeros(len(limits[0]), np.float32) for _ in range(3))
+    column[::2], height[::2], shares[::2] = leads.column, np.where(good, leads.height, np.float32(0.0)), known
+    between = len(column[1::2])
+    after = np.minimum(np.arange(1, between + 1), len(good) - 1)
+    both = np.flatnonzero(
+        good[:between] & good[after] & (np.abs(leads.column[:between] - leads.column[after]) < STEEP_PX)
+    )
+    middle = 0.5 * (leads.column[both] + leads.column[after[both]])
+    at, response = stand_out(sight.lit, np.minimum((2 * both + 1) * BLOCK + 1, len(sight.lit) - 1), middle, sight.noise)
+    least = np.minimum(leads.height[both], leads.height[after[both]])
+    odd = 2 * both + 1
+    column[odd], shares[odd] = at, 0.5 * (known[both] + known[after[both]])
+    height[odd] = np.where(response > _GOES_ON * least, response, np.float32(0.0))
+    shares[height == 0] = np.nan
+    return Candidates(column[:, None], (height / np.float32(unit_of(sight.noise, True)))[:, None]), shares
 
 
 def _all_candidates(sight: Sight, blocks: Index, window: F64, min_snr: float) -> Candidates:

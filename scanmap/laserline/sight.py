@@ -31,7 +31,7 @@ class Sight(NamedTuple):
     off: U8 | None  # (H, W) the laser-off frame's
     plane: U8  # (H, W) the brighter of both
     lit: U8  # (H, W) what the laser added, lifted by PEDESTAL, with a laser-off frame; else the plane
-    rows: U8  # (B, W) of lit: the second row of each block, contiguous
+    rows: U8  # (ceil(B / 2), W) of lit: one row of every other block, contiguous
     image: U8 | None  # (H, W, 3) where colour tells the laser from other things
     channel: int  # of the image; -1 without one
     noise: float  # of a sample of lit [grey levels]
@@ -46,7 +46,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     if image.ndim == 3:
         channel = channel_of(image, background, how.grey)
     if channel is not None and background is None:
-        rows = np.asarray(cv2.extractChannel(second_rows(image), channel), np.uint8)
+        rows = np.asarray(cv2.extractChannel(quick_rows(image), channel), np.uint8)
         # Most of a large picture is never looked at.
         plane = image[..., channel] if is_large(image) else extract(image, channel)
         return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows))
@@ -55,7 +55,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     if background is not None:
         off = to_grey(background, how.grey, how.bit_index, channel)
         lit, plane = without_background(on, off, how.off_threshold), np.asarray(cv2.max(on, off), np.uint8)
-    rows = np.ascontiguousarray(second_rows(lit))
+    rows = np.ascontiguousarray(quick_rows(lit))
     return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows))
 
 
@@ -66,10 +66,10 @@ def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
     return CHANNEL.get(grey)
 
 
-def second_rows(image: U8) -> U8:
-    """The second row of each block of rows (B, ...)."""
-    rows = image[1::BLOCK]
-    return rows if len(rows) == -(-len(image) // BLOCK) else np.concatenate([rows, image[-1:]])
+def quick_rows(image: U8) -> U8:
+    """The second row of every other block of rows (ceil(B / 2), ...)."""
+    rows = image[1 :: 2 * BLOCK]
+    return rows if len(rows) == -(-len(image) // (2 * BLOCK)) else np.concatenate([rows, image[-1:]])
 
 
 def _noise(plane: U8, rows: U8) -> float:
