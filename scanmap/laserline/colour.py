@@ -20,6 +20,11 @@ _COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much ha
 _STRANGER = 0.62
 _UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
 _MOSTLY = 0.75  # share of a run's rows
+_PURE = 0.45  # height in other channels of a line whose flanks must show its colour
+# By how much the laser's channel leads beside a saturated core, as a share of all light there and of the core's own:
+# white by the less, coloured by the more.
+_NEAR, _LEAD = (0.04, 0.08), (0.1, 0.3)
+_FLANK = 15  # [grey levels] that a flank must rise by
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
@@ -64,7 +69,8 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     block, which = np.nonzero((candidates.snr > 3.0) & np.isnan(shares)[:, None])
     if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
         return doubt
-    height, brightest = _heights(image, block, candidates.column[block, which])
+    profile, brightest = _profiles(image, block, candidates.column[block, which])
+    height = profile[:, _HALF - 2 : _HALF + 3].mean(axis=1) - profile[:, [0, 1, -2, -1]].mean(axis=1)
     own = np.maximum(height[:, channel], 1.0)
     other = np.delete(height, channel, axis=1).max(axis=1)
     saturated = brightest[:, channel] >= COLOURLESS
@@ -72,14 +78,21 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
     share[:, 0] = shares
     share[block, which] = other / own
+    at = np.flatnonzero(saturated)
+    near, beyond = _flank_lead(profile[at].transpose(1, 2, 0), channel)
+    coloured = np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
     laser = _laser_share(candidates, share)
     if laser is None or laser > _COLOURLESS_SHARE:
+        doubt[block[at], which[at]] = coloured
         return doubt
     # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
     excess = other - (max(laser, 0.0) + 0.4) * own
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
     factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * own), 0.0, 1.0)
-    doubt[block, which] = np.where(saturated, _UNTOLD, factor)
+    # Where a laser of pure colour saturates white, what is beside the core still has the colour.
+    pure = _between(beyond, *_LEAD) if laser < _PURE else _UNTOLD * coloured
+    factor[at] = np.maximum(factor[at], pure)
+    doubt[block, which] = factor
     return doubt
 
 
@@ -93,7 +106,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
         pure: (H,) rows known to be of its colour; a run of mostly such is not asked.
 
     Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
-    parts are asked. Where the core saturates they say nothing.
+    parts are asked. Where the core saturates they say nothing, but what is beside it must not be white.
     """
     lost = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
@@ -108,6 +121,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
     height, brightest = heights_of(image, row, middle)
     clipped = brightest[channel] >= COLOURLESS
     by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
+    lost[row] = _white_beside(image, row, middle, channel, clipped, run)
     stranger = _in_other_channels(by_run, np.bincount(run), channel)[run]
     if stranger.any():
         # Sums over the rows nearby as differences of sums from the start.
@@ -121,6 +135,26 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
     return lost
 
 
+def _between(values: F32, low: float, high: float) -> F32:
+    """0 below `low`, 1 above `high`, straight between."""
+    part: F32 = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return part
+
+
+def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: Mask, run: Index) -> Mask:
+    """Rows (N,) of runs whose core saturates with white beside it: a gap in a blind, a tube of light."""
+    white = np.zeros(len(row), bool)
+    many = np.bincount(run, clipped) > 0.3 * np.bincount(run)
+    at = np.flatnonzero(many[run] & clipped)
+    if at.size:
+        leads = _flank_lead(_across(image, row[at], middle[at]).astype(np.float32), channel)
+        seen = leads[0] < 1.0
+        count = np.bincount(run[at], seen, minlength=len(many))
+        near, beyond = (np.bincount(run[at], seen * lead, minlength=len(many)) for lead in leads)
+        white = (many & (near < sum(_NEAR) / 2 * count) & (beyond < sum(_LEAD) / 2 * count))[run]
+    return white
+
+
 def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) -> Mask:
     """Whether parts stand out in another channel; `total` (4, N): heights by channel, clipped rows; of `rows` (N,)."""
     other = np.maximum(total[:3][channel - 1], total[:3][channel - 2])
@@ -130,28 +164,53 @@ def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) ->
 
 def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.int16]]:
     """Heights (3, N) above their sides of N places of a picture (H, W, 3), by channel, and their middles' samples."""
-    length = 2 * _HALF + 1
-    x = np.clip(column, _HALF, image.shape[1] - 1 - _HALF)
-    runs = runs_of(image, 3 * length)[row, 3 * (x - _HALF)]
-    y = np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
+    y = _across(image, row, column)
     core = y[_HALF - 2] + y[_HALF - 1] + y[_HALF] + y[_HALF + 1] + y[_HALF + 2]
     side = y[0] + y[1] + y[-2] + y[-1]
     return core * np.float32(0.2) - side * np.float32(0.25), y[_HALF]
 
 
-def _heights(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
-    """Heights (N, 3) of candidates above their sides by channel, and their brightest samples (N, 3)."""
+def _across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
+    """Samples (2 _HALF + 1, 3, N) around N places of a picture (H, W, 3)."""
+    length = 2 * _HALF + 1
+    x = np.clip(column, _HALF, image.shape[1] - 1 - _HALF)
+    runs = runs_of(image, 3 * length)[row, 3 * (x - _HALF)]
+    return np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
+
+
+def _profiles(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
+    """Mean profiles (N, 2 _HALF + 1, 3) of blocks' rows around candidates, and their brightest core samples (N, 3)."""
     height, width = image.shape[:2]
     row = np.minimum(block * BLOCK, height - BLOCK)
     x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
     length = 2 * _HALF + 1
     view = runs_of(image, 3 * length)
     first = view[row[:, None] + np.arange(BLOCK), 3 * (x - _HALF)[:, None]].reshape(-1, BLOCK, length, 3)
-    total = first.sum(axis=1, dtype=np.uint16)
-    core = total[:, _HALF - 2 : _HALF + 3]
-    side = total[:, :2].sum(axis=1) + total[:, -2:].sum(axis=1)
-    heights = (core.sum(axis=1) / (5.0 * BLOCK) - side / (4.0 * BLOCK)).astype(np.float32)
-    return heights, first[:, :, _HALF - 2 : _HALF + 3].max(axis=(1, 2))
+    profile = first.sum(axis=1, dtype=np.uint16) * np.float32(1.0 / BLOCK)
+    return profile, first[:, :, _HALF - 2 : _HALF + 3].max(axis=(1, 2))
+
+
+def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
+    """How far the laser's channel leads the others beside a saturated core, over how bright it is there (N,).
+
+    Args:
+        y: (n, 3, N) samples across the core.
+        channel: the laser's.
+
+    Returns:
+        the share of all the light there, and that of the light above the samples' ends; 1 where no flank is seen.
+    """
+    own, others = y[:, channel], np.maximum(y[:, channel - 1], y[:, channel - 2])
+    ends = [0, 1, -2, -1]
+    rise = np.where(np.maximum(own, others) < COLOURLESS, own - own[ends].min(axis=0), 0.0)
+    lead = own - others
+    index, half = np.arange(y.shape[2]), len(y) // 2
+    left, right = rise[2:half].argmax(axis=0) + 2, rise[half:-2].argmax(axis=0) + half
+    leads, height = lead[left, index] + lead[right, index], rise[left, index] + rise[right, index]
+    hidden = np.minimum(rise[left, index], rise[right, index]) < _FLANK
+    near = leads / np.maximum(own[left, index] + own[right, index], 1.0)
+    beyond = (leads - 2.0 * lead[ends].mean(axis=0)) / np.maximum(height, 1.0)
+    return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
 
 
 def _laser_share(candidates: Candidates, share: F32) -> float | None:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from scanmap.laserline.candidates import COLOURLESS
 from scanmap.laserline.colour import heights_of
 from scanmap.laserline.path import JUMP
 
@@ -97,19 +96,18 @@ def shares_of(rows: U8, leads: Leads, channel: int, good: Mask) -> F32:
         channel: the laser's own.
         good: (B,) the leads in question.
 
-    As pure as any laser is, or too bright to have a colour.
+    As pure as any laser is: clipped, a line's own height is too small and its share too large, never too pure.
     """
     block = np.flatnonzero(good)
     shares = np.full(len(rows), np.nan, np.float32)
     if not block.size:
         return shares
-    height, middle = heights_of(rows, block, np.rint(leads.column[block]).astype(np.intp))
+    height, _ = heights_of(rows, block, np.rint(leads.column[block]).astype(np.intp))
     own, other = height[channel], np.maximum(height[channel - 1], height[channel - 2])
-    saturated = middle[channel] >= COLOURLESS
     # The mean over neighbours on the same line is known far better than one row's.
     smooth = cv2.blur(np.stack([other, own]), (5, 1), borderType=cv2.BORDER_REPLICATE)
     share = smooth[0] / np.maximum(smooth[1], np.float32(1.0))
-    pure = saturated | (other < _PURE * own) | (share < 0.9 * _PURE)
+    pure = (other < _PURE * own) | (share < 0.9 * _PURE)
     shares[block[pure]] = share[pure]
     return shares
 
