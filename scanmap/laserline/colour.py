@@ -23,7 +23,7 @@ _MOSTLY = 0.75  # share of a run's rows
 _PURE = 0.45  # height in other channels of a line whose flanks must show its colour
 # By how much the laser's channel leads beside a saturated core, as a share of all light there and of the core's own:
 # white by the less, coloured by the more.
-_NEAR, _LEAD = (0.04, 0.08), (0.1, 0.3)
+_NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
 _FLANK = 15  # [grey levels] that a flank must rise by
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
@@ -80,7 +80,9 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     share[block, which] = other / own
     at = np.flatnonzero(saturated)
     near, beyond = _flank_lead(profile[at].transpose(1, 2, 0), channel)
-    coloured = np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
+    # A core with no flank in sight is wider than lines are; what bars are is judged elsewhere.
+    seen = np.where(near < 1.0, 1.0, _UNTOLD).astype(np.float32)
+    coloured = seen * np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
     laser = _laser_share(candidates, share)
     if laser is None or laser > _COLOURLESS_SHARE:
         doubt[block[at], which[at]] = coloured
@@ -90,7 +92,7 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
     factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * own), 0.0, 1.0)
     # Where a laser of pure colour saturates white, what is beside the core still has the colour.
-    pure = _between(beyond, *_LEAD) if laser < _PURE else _UNTOLD * coloured
+    pure = seen * _between(beyond, *_LEAD) if laser < _PURE else _UNTOLD * coloured
     factor[at] = np.maximum(factor[at], pure)
     doubt[block, which] = factor
     return doubt

@@ -40,7 +40,7 @@ _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 # Short runs of rows known no better than this are given up, and those that stand out of what is left of the room's own
 # edges by no more than the second; single rows by no more than the first.
-_WEAK_PX, _STANDS_OUT = 0.2, (2.0, 4.0)
+_WEAK_PX, _STANDS_OUT = 0.2, (2.5, 5.0)
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 

@@ -14,6 +14,7 @@ _CONTRAST = 16  # [grey levels] from which on a place has any
 _BRIGHTEST = 240  # [grey levels] brighter ones are cut
 _ROW_STEP = 8
 _FEW = 50
+_SHARE = 0.04  # of a contrast that a shaken camera leaves besides
 
 
 def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> F64:
@@ -27,22 +28,22 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
     Returns:
         (H,) heights in standard deviations of what is left; infinite where the room is even, or has no line.
 
-    How much remains of a contrast is measured in the two pictures themselves, as a share of it.
+    What remains where the room has contrast is measured in the two pictures themselves.
     """
     ratio = np.full(len(column), np.inf)
     row = np.flatnonzero(np.isfinite(column))
-    share = _remaining(image, background, gain) if row.size else 0.0
-    if share > 0.0:
+    left = _remaining(image, background, gain) if row.size else 0.0
+    if left > 0.0:
         middle = np.rint(column[row]).astype(np.intp)
         x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, background.shape[1] - 1)
         contrast = gain * np.ptp(background[row[:, None], x].astype(np.float32), axis=1)
         uneven = contrast > _CONTRAST
-        ratio[row[uneven]] = peak[row[uneven]] / (share * contrast[uneven])
+        ratio[row[uneven]] = peak[row[uneven]] / np.hypot(left, _SHARE * contrast[uneven])
     return ratio
 
 
 def _remaining(image: U8, background: U8, gain: float) -> float:
-    """Standard deviation of the difference over the contrast at that place, where there is contrast."""
+    """Standard deviation of the difference where there is contrast [grey levels]; 0 where there is none."""
     on, off = (np.ascontiguousarray(plane[_ROW_STEP // 2 :: _ROW_STEP]) for plane in (image, background))
     if not len(on):
         return 0.0
@@ -52,4 +53,4 @@ def _remaining(image: U8, background: U8, gain: float) -> float:
     if np.count_nonzero(usable) < _FEW:
         return 0.0
     left = np.abs(on[usable] - gain * off[usable].astype(np.float32))
-    return float(1.48 * np.median(left / (gain * contrast[usable])))
+    return float(1.48 * np.median(left))
