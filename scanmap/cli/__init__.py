@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, look, scanning, settings, tabling, terminal
+from scanmap.cli import calibrating, latency, look, scanning, settings, tabling, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -31,6 +31,7 @@ app.command("map")(look.make_map)
 app.command()(look.info)
 app.command()(settings.config)
 calibrating.calibrate.command()(tabling.table)
+calibrating.calibrate.command()(latency.latency)
 app.add_typer(calibrating.calibrate)
 
 

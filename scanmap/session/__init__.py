@@ -11,6 +11,7 @@ from scanmap.session.inspection import (
     watch,
 )
 from scanmap.session.job import Job, Progress, Result
+from scanmap.session.latency import measure_latency
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
 from scanmap.view import show
@@ -25,6 +26,7 @@ __all__ = [
     "map_lines",
     "map_of_cloud",
     "map_settings",
+    "measure_latency",
     "prepare_replay",
     "prepare_scan",
     "prepare_view",

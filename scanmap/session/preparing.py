@@ -83,7 +83,7 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
         shots=lambda: sweep(opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock),
         total=len(swept.bearings),
         comments=_comments(is_twin=is_twin),
-        announcement=[_rig_words(config, opened.rig), swept.words],
+        announcement=[rig_words(config, opened.rig), swept.words],
         truth=opened.truth,
         closers=[opened.close],
     )
@@ -176,7 +176,7 @@ def _comments(*, is_twin: bool) -> dict[str, Any]:
     return comments
 
 
-def _rig_words(config: Config, rig: Rig) -> str:
+def rig_words(config: Config, rig: Rig) -> str:
     """What is about to move, or that nothing is."""
     if rig.is_twin:
         return f"DIGITAL TWIN: no hardware is used, the room is made up ({config.twin.room})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 
@@ -64,7 +65,8 @@ class DelayedCamera:
     def newest(self) -> Frame:
         """The next picture to arrive; others are exposed meanwhile."""
         while not self._coming or self._coming[0].time > self._clock():
-            self._wait(self._period_s)
+            now = self._clock()  # it runs freely, whoever looks and however long nobody did
+            self._wait((math.floor(now / self._period_s + 1e-6) + 1) * self._period_s - now)
             frame = self._camera.grab()
             self._coming.append(Frame(frame.image, frame.time + self._delay()))
         image, arrival = self._coming.popleft()

@@ -1,0 +1,41 @@
+"""`scanmap calibrate latency`: how much later than its exposure the camera's picture is stamped."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import typer
+
+from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
+
+
+def latency(
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    calibration: CalibrationOption = None,
+    method: Annotated[
+        Literal["sweep", "blink"],
+        typer.Option(
+            "--method",
+            metavar="sweep|blink",
+            help="sweep: turn forward and backward; blink: switch the laser, with the head at rest.",
+        ),
+    ] = "sweep",
+    speed_deg_s: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--speed-deg-s", metavar="SPEED", help="Of the sweeps; two of them tell latency and backlash apart."
+        ),
+    ] = None,
+) -> None:
+    """Measure the camera's latency, for sweeps that shoot while turning.
+
+    Example: scanmap calibrate latency --config my-rig.toml
+    """
+    from scanmap import session
+    from scanmap.cli.terminal import say, stop_on_signal
+
+    choice = session.Choice(config, tuple(set_ or ()), calibration)
+    with stop_on_signal():
+        for line in session.measure_latency(choice, method, tuple(speed_deg_s or ()), say):
+            say(line)

@@ -1,0 +1,190 @@
+"""Drive a rig so that its camera's latency shows: sweeps in both directions, or a blinking laser."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.calibration import Calibration
+from scanmap.config import Config
+from scanmap.errors import CameraError, ConfigError
+from scanmap.pipeline import Pipeline
+from scanmap.rig import Frame, Rig, Streaming
+from scanmap.session.preparing import Choice, rig_words
+from scanmap.session.rigs import OpenRig, open_rig
+from scanmap.shot import decode_image
+from scanmap.solvers.latency import Blink, Latency, Pass, latency_of_blinks, latency_of_sweeps
+from scanmap.sweep import SweepParams, sweep
+from scanmap.sweep.sweeping import Turning
+
+BLINKS = 24
+REST_S = 0.35  # after a switch, beyond the latency searched for
+GOLDEN = 0.618033988749895  # multiples of it fill a period evenly
+CONTRAST_DN = 12.0  # [grey levels] a pixel belongs to the line if the laser adds this to it
+LEAST_LIT = 30  # pixels
+ROWS = 240  # of an image are enough
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """What the laser adds to a picture."""
+
+    lit_px: int  # pixels that become clearly brighter
+    level_dn: float  # by how much, median of these [grey levels]
+    mask: NDArray[np.bool_]  # (H, W)
+    on: float  # mean grey level of them with the laser on
+    off: float
+
+
+def measure_latency(choice: Choice, method: str, speeds_deg_s: tuple[float, ...], progress: Progress) -> list[str]:
+    """Open the rig, measure by `sweep` or `blink`, close it; the result in lines.
+
+    Raises:
+        ConfigError, CalibrationError, CameraError, StageError: as `latency_by_sweeps` and `latency_by_blinks`.
+    """
+    config = choice.load()
+    head = choice.head() or config.head()
+    opened = open_rig(config, head)
+    try:
+        progress(rig_words(config, opened.rig))
+        if method == "blink":
+            found, contrast = latency_by_blinks(opened, progress)
+            about = f"laser on and off differ by {contrast.level_dn:.0f} grey levels in {contrast.lit_px} pixels"
+        else:
+            speeds = speeds_deg_s or (config.sweep.speed_deg_s, config.sweep.speed_deg_s / 2)
+            found = latency_by_sweeps(opened, config, head, speeds, progress)
+            about = f"play of the gear: {found.backlash_deg:.3f} deg" if len(set(speeds)) > 1 else ""
+    finally:
+        opened.close()
+    corrected = config.camera.latency_s or 0.0 if opened.rig.is_twin else config.camera.latency
+    by_sweep = config.sweep.latency_s if method == "sweep" else 0.0
+    latency_s = corrected + by_sweep + found.latency_s
+    lines = [
+        f"camera latency {1e3 * latency_s:.1f} ms, standard deviation {1e3 * found.sigma_s:.1f} ms, "
+        f"from {found.samples} {'rows' if method == 'sweep' else 'blinks'}",
+        about,
+        f"next: under [camera] in the rig's TOML write latency_s = {latency_s:.4f}, or give --set "
+        f"camera.latency_s={latency_s:.4f}",
+    ]
+    return [line for line in lines if line]
+
+
+def latency_by_sweeps(
+    opened: OpenRig, config: Config, calibration: Calibration, speeds_deg_s: tuple[float, ...], progress: Progress
+) -> Latency:
+    """Sweep forward and backward at each speed and see by how much the two differ.
+
+    Args:
+        speeds_deg_s: two tell latency and backlash apart.
+        progress: gets a line about every sweep.
+
+    Raises:
+        ConfigError: the stage cannot turn steadily.
+        CalibrationError: too little is seen in both directions.
+        CameraError, StageError: the rig failed.
+    """
+    if not isinstance(opened.rig.stage, Turning):
+        raise ConfigError("latency by sweeps needs a stage of kind grbl: choose --method blink")
+    process = Pipeline(calibration, config.laserline, config.triangulation).process
+    every = max(1, calibration.intrinsics.height // ROWS)
+    passes = []
+    for speed in speeds_deg_s:
+        progress(f"sweeping forward and backward at {speed:g} deg/s")
+        plan = config.sweep.model_dump() | {
+            "mode": "continuous", "passes": 2, "speed_deg_s": speed, "step_deg": 0.01, "off_frames": False,
+        }  # fmt: skip
+        bearings, columns = [], []
+        for shot in sweep(opened.rig, SweepParams(**plan), sleep=opened.sleep, clock=opened.clock):
+            bearings.append(shot.bearing)
+            columns.append(process(shot).line.column_px[::every])
+        passes.append((math.radians(speed), *_two_passes(np.array(bearings), np.array(columns))))
+    return latency_of_sweeps(passes)
+
+
+def latency_by_blinks(opened: OpenRig, progress: Progress, blinks: int = BLINKS) -> tuple[Latency, Contrast]:
+    """Switch the laser and see when the pictures show it; the laser is off afterwards.
+
+    Raises:
+        ConfigError: the laser cannot be switched, or the camera sends single pictures only.
+        CalibrationError: the pictures do not show it.
+        CameraError, StageError: the rig failed.
+    """
+    rig = opened.rig
+    if not rig.stage.laser_switchable:
+        raise ConfigError("the laser cannot be switched by software, so it cannot blink: choose --method sweep")
+    if not isinstance(rig.camera, Streaming):
+        raise ConfigError("this camera sends single pictures only: its latency cannot be measured")
+    try:
+        contrast = laser_contrast(rig)
+        progress(f"blinking the laser {blinks} times")
+        period_s = _period(rig.camera)
+        seen = []
+        for number in range(2 * blinks):
+            phase_s = period_s * ((number * GOLDEN) % 1.0)
+            seen.append(_blink(opened, rig.camera, contrast, phase_s, on=number % 2 == 0))
+        return latency_of_blinks(seen), contrast
+    finally:
+        rig.stage.laser(False)
+
+
+def laser_contrast(rig: Rig) -> Contrast:
+    """How clearly the laser shows in a picture; the laser is off afterwards.
+
+    Raises:
+        CameraError: it does not show at all.
+    """
+    levels = []
+    for on in (True, False):
+        rig.stage.laser(on)
+        levels.append(_brightness(rig.camera.grab()))
+    added = levels[0].astype(np.int16) - levels[1]
+    mask = added > CONTRAST_DN
+    if np.count_nonzero(mask) < LEAST_LIT:
+        raise CameraError(
+            f"the laser makes no difference in the picture (at most {int(added.max())} grey levels): is it on, does it "
+            "shine into the camera's view, is camera.exposure_us high enough?"
+        )
+    lit = added[mask]
+    on_off = float(levels[0][mask].mean()), float(levels[1][mask].mean())
+    return Contrast(int(np.count_nonzero(mask)), float(np.median(lit)), mask, *on_off)
+
+
+def _blink(opened: OpenRig, camera: Streaming, contrast: Contrast, phase_s: float, *, on: bool) -> Blink:
+    """Switch once and look until the pictures have long shown it."""
+    frames = [camera.newest(), camera.newest()]
+    opened.sleep(phase_s)
+    before = opened.clock()
+    opened.rig.stage.laser(on)
+    after = opened.clock()
+    # A picture's own time tells when all pictures exposed before the switch have come.
+    while frames[-1].time < after + REST_S:
+        frames.append(camera.newest())
+    spread = contrast.on - contrast.off
+    levels = [(float(_brightness(frame)[contrast.mask].mean()) - contrast.off) / spread for frame in frames]
+    return Blink((before + after) / 2, np.array([frame.time for frame in frames]), np.array(levels))
+
+
+def _brightness(frame: Frame) -> NDArray[np.uint8]:
+    """(H, W) the brightest channel of each pixel: a red line is bright in red."""
+    image = decode_image(frame.image).image
+    return image if image.ndim == 2 else np.asarray(image.max(axis=2), np.uint8)
+
+
+def _period(camera: Streaming) -> float:
+    times = [camera.newest().time for _ in range(6)]
+    return max(1e-3, float(np.median(np.diff(times))))
+
+
+def _two_passes(bearings: NDArray[np.float64], columns: NDArray[np.float64]) -> tuple[Pass, Pass]:
+    """Split where the head turned round."""
+    if len(bearings) < 20:
+        raise CameraError(f"only {len(bearings)} pictures came while the head turned: turn slower, or farther")
+    forward = bearings[-1] < bearings[len(bearings) // 2]
+    turn = int(np.argmax(bearings) if forward else np.argmin(bearings)) + 1
+    return Pass(bearings[:turn], columns[:turn]), Pass(bearings[turn:], columns[turn:])
