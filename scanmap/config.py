@@ -78,9 +78,9 @@ class Config(BaseModel, frozen=True, extra="forbid"):
 
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
-    def explained(self) -> str:
-        """This configuration as TOML in which every key says its meaning, unit and limits."""
-        return "\n".join(_explain(self, ())) + "\n"
+    def explained(self, keys: tuple[str, ...] | None = None) -> str:
+        """This configuration as TOML in which every key says its meaning, unit and limits; only `keys`, if given."""
+        return "\n".join(_explain(self, (), keys)) + "\n"
 
 
 def preset_names() -> list[str]:
@@ -222,12 +222,14 @@ def _table_of(info: FieldInfo) -> type[BaseModel] | None:
     return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
 
 
-def _explain(model: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
+def _explain(model: BaseModel, path: tuple[str, ...], keys: tuple[str, ...] | None = None) -> Iterator[str]:
     """TOML lines of one table: plain keys first, as TOML wants it, then the tables below."""
     import tomli_w
 
     tables, left_out = [], []
     for name, info in type(model).model_fields.items():
+        if keys is not None and name not in keys:
+            continue
         value = getattr(model, name)
         if isinstance(value, BaseModel):
             tables.append((name, value, info))

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, latency, look, scanning, settings, tabling, terminal
+from scanmap.cli import calibrating, hardware, latency, look, scanning, settings, tabling, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -30,6 +30,9 @@ app.command()(look.view)
 app.command("map")(look.make_map)
 app.command()(look.info)
 app.command()(settings.config)
+app.command()(hardware.doctor)
+app.command()(hardware.init)
+app.add_typer(hardware.stage)
 calibrating.calibrate.command()(tabling.table)
 calibrating.calibrate.command()(latency.latency)
 app.add_typer(calibrating.calibrate)

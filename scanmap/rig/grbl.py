@@ -19,7 +19,7 @@ from scanmap.rig.serial_port import open_serial, serial_devices
 from scanmap.rig.stage import StageParams, check_limits
 from scanmap.rig.watchdog import Watchdog
 
-__all__ = ["GrblStage", "StageParams", "open_grbl"]
+__all__ = ["GrblStage", "StageParams", "identify", "open_grbl"]
 
 BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
 GREETING_S = 0.3  # a board behind a network says its banner at once, if at all
@@ -283,6 +283,21 @@ def open_grbl(params: StageParams) -> GrblStage:
         + ("; ".join(faults) or "no serial port on this machine")
         + "): plug it in, or set stage.port; `scanmap doctor` lists what answers"
     )
+
+
+def identify(url: str, params: StageParams) -> str:
+    """Firmware and version of the board on a port; changes no setting, though opening may reset the board.
+
+    Raises:
+        StageError: the port cannot be opened, or nothing there answers like a GRBL board.
+    """
+    link = GrblLink(open_serial(url, params.baud), params.timeout_s)
+    try:
+        banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
+        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
+        return f"{dialect.value} {banner.version}"
+    finally:
+        link.close()
 
 
 def _open_port(url: str, params: StageParams) -> GrblStage:

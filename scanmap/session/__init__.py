@@ -1,6 +1,8 @@
 """Opens what a config names, runs it, writes it, and holds it against the twin's truth; for cli and panel."""
 
 from scanmap.session.description import describe
+from scanmap.session.doctor import Finding, examine
+from scanmap.session.first_config import Drive, Head, first_config
 from scanmap.session.inspection import (
     map_lines,
     map_of_cloud,
@@ -14,15 +16,23 @@ from scanmap.session.job import Job, Progress, Result
 from scanmap.session.latency import measure_latency
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
+from scanmap.session.stage_work import home, jog, switch_laser, where
 from scanmap.view import show
 
 __all__ = [
     "Choice",
+    "Drive",
+    "Finding",
+    "Head",
     "Job",
     "Outputs",
     "Progress",
     "Result",
     "describe",
+    "examine",
+    "first_config",
+    "home",
+    "jog",
     "map_lines",
     "map_of_cloud",
     "map_settings",
@@ -33,5 +43,7 @@ __all__ = [
     "show",
     "show_as_it_is",
     "shown_as_it_is",
+    "switch_laser",
     "watch",
+    "where",
 ]

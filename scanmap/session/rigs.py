@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -63,6 +63,24 @@ def open_rig(config: Config, calibration: Calibration, ask: Callable[[str], str]
         f"rig = {config.rig!r} describes recordings, not a rig that is here; try scanmap replay SOURCE, or set "
         "rig = 'hardware' or 'twin'"
     )
+
+
+@contextmanager
+def opened_stage(config: Config, ask: Callable[[str], str] = input) -> Iterator[Stage]:
+    """The stage alone, of the twin or of this machine; closed at the end: laser off, motor free.
+
+    Raises:
+        ConfigError, StageError: there is none, or it does not do what it should.
+    """
+    with ExitStack() as opened:
+        params = config.stage
+        if config.rig == "twin":
+            params = params.model_copy(update={"kind": "grbl", "port": opened.enter_context(plug(_board(config)))})
+        elif config.rig != "hardware":
+            raise ConfigError(f"rig = {config.rig!r} has no stage: set rig = 'hardware' or 'twin'")
+        stage = open_stage(params, ask)
+        opened.callback(stage.close)
+        yield stage
 
 
 def open_hardware(config: Config, size: tuple[int, int] | None, ask: Callable[[str], str] = input) -> OpenRig:
