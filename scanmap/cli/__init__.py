@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, hardware, latency, look, scanning, settings, tabling, terminal
+from scanmap.cli import calibrating, hardware, latency, live, look, scanning, settings, tabling, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 app.command()(scanning.scan)
 app.command()(scanning.replay)
+app.command()(live.live)
 app.command()(look.view)
 app.command("map")(look.make_map)
 app.command()(look.info)

@@ -14,12 +14,16 @@ from scanmap.session.inspection import (
 )
 from scanmap.session.job import Job, Progress, Result
 from scanmap.session.latency import measure_latency
+from scanmap.session.live import HELP as KEYS_HELP
+from scanmap.session.live import open_live
+from scanmap.session.live_view import open_live_view, watching_words
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
 from scanmap.session.stage_work import home, jog, switch_laser, where
 from scanmap.view import show
 
 __all__ = [
+    "KEYS_HELP",
     "Choice",
     "Drive",
     "Finding",
@@ -37,6 +41,8 @@ __all__ = [
     "map_of_cloud",
     "map_settings",
     "measure_latency",
+    "open_live",
+    "open_live_view",
     "prepare_replay",
     "prepare_scan",
     "prepare_view",
@@ -45,5 +51,6 @@ __all__ = [
     "shown_as_it_is",
     "switch_laser",
     "watch",
+    "watching_words",
     "where",
 ]

@@ -38,6 +38,7 @@ def open_view(
     rrd: Path | None,
     live_port: int | None,
     laserline: LaserLineParams | None = None,
+    tab: str = "scan",
 ) -> View:
     """Open a view of one scan.
 
@@ -50,6 +51,7 @@ def open_view(
         rrd: file to write, or None.
         live_port: port on this machine to serve a live view on, or None.
         laserline: grey conversion for the thesis's pictures; its defaults if left out.
+        tab: the one in front, of `entities.TABS`.
 
     Raises:
         ConfigError: the file cannot be written, the port is taken, or `params.row` is not in the image. From
@@ -62,7 +64,9 @@ def open_view(
     chosen_row(calibration.intrinsics.height, params)
     sinks = _sinks(params, rrd, live_port)
     recording = rr.RecordingStream(at.APPLICATION)
-    recording.set_sinks(*sinks, default_blueprint=layout(rows=calibration.intrinsics.height, thesis=params.thesis_tab))
+    recording.set_sinks(
+        *sinks, default_blueprint=layout(rows=calibration.intrinsics.height, thesis=params.thesis_tab, tab=tab)
+    )
     recording.send_recording_name(title)
     recording.send_property("scan", rr.AnyValues(source=source_words(is_twin)))
     recording.set_time(at.SHOT, sequence=0)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Concatenate, ParamSpec
 import numpy as np
 
 from scanmap.calibration import Calibration
-from scanmap.laserline import Reason
+from scanmap.laserline import LaserLineParams, Reason
 from scanmap.pipeline import Step
 from scanmap.scan import Scan
 from scanmap.view import entities as at
@@ -109,6 +109,12 @@ class View:
             if self._steps % self._params.thesis_every == 0 and readable:
                 self._thesis.log_pictures(step)
         self._steps += 1
+
+    @isolated
+    def look_at(self, params: ViewParams, laserline: LaserLineParams) -> None:
+        """From the next shot on show the thesis's view with another row, grey conversion or overlay colour."""
+        if self._thesis is not None:
+            self._thesis = ThesisView(self._recording, self._calibration, laserline, params)
 
     @isolated
     def grid(self, grid: OccupancyGrid) -> None:
