@@ -13,7 +13,17 @@ from scanmap.errors import CameraError
 from scanmap.rig.camera_capture import BACKENDS
 from scanmap.rig.camera_checks import Size
 
-USUAL_SIZES = ((640, 480), (800, 600), (1280, 720), (1280, 960), (1600, 1200), (1920, 1080), (2592, 1944), (3840, 2160))
+USUAL_SIZES = (
+    (320, 240),
+    (640, 480),
+    (800, 600),
+    (1280, 720),
+    (1280, 960),
+    (1600, 1200),
+    (1920, 1080),
+    (2592, 1944),
+    (3840, 2160),
+)
 TIMED_PICTURES = 8
 PATIENCE_S = 2.0  # for one size
 

@@ -2,7 +2,6 @@
 
 from scanmap.session.description import describe
 from scanmap.session.doctor import Finding, examine
-from scanmap.session.first_config import Drive, Head, first_config
 from scanmap.session.inspection import (
     map_lines,
     map_of_cloud,
@@ -17,6 +16,7 @@ from scanmap.session.latency import measure_latency
 from scanmap.session.live import HELP as KEYS_HELP
 from scanmap.session.live import open_live
 from scanmap.session.live_view import open_live_view, watching_words
+from scanmap.session.new_rig import Drive, Head, first_config
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
 from scanmap.session.stage_work import home, jog, switch_laser, where

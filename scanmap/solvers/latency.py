@@ -18,6 +18,7 @@ STEPS_ROUND = 41  # of the search, each round ten times finer
 ROUNDS = 3
 BLOCKS = 8  # bearings are left out in so many blocks in turn, to see how sure the result is
 LEAST_PAIRS = 200  # of rows seen in both directions
+BESIDE = 1  # pictures
 TUKEY = 4.685  # 95 % efficient for Gaussian noise (Huber, Ronchetti 2009)
 
 
@@ -190,13 +191,19 @@ def _refined(front: Pass, back: Pass, shift: float) -> tuple[float, int]:
 
 
 def _difference(front: Pass, back: Pass, shift: float) -> tuple[Array, Array]:
-    """Columns of the forward pass minus those of the backward one at the shifted bearing; and its slope in `shift`."""
+    """Columns of the forward pass minus those of the backward one at the shifted bearing; and its slope in `shift`.
+
+    The slope is taken from pictures beside the two that are interpolated: from the same two its noise would be
+    that of the difference, and pull the shift toward one of them.
+    """
     at = front.bearings - shift
-    k = np.clip(np.searchsorted(back.bearings, at) - 1, 0, len(back.bearings) - 2)
-    width = back.bearings[k + 1] - back.bearings[k]
-    share = ((at - back.bearings[k]) / width)[:, None]
-    step = back.columns[k + 1] - back.columns[k]
-    outside = (at < back.bearings[0]) | (at > back.bearings[-1])
-    difference = front.columns - (back.columns[k] + share * step)
-    difference[outside] = np.nan
-    return difference, step / width[:, None]
+    last = len(back.bearings) - 1
+    k = np.clip(np.searchsorted(back.bearings, at) - 1, 0, last - 1)
+    share = ((at - back.bearings[k]) / (back.bearings[k + 1] - back.bearings[k]))[:, None]
+    difference = front.columns - (back.columns[k] * (1.0 - share) + back.columns[k + 1] * share)
+    difference[(at < back.bearings[0]) | (at > back.bearings[-1])] = np.nan
+    before, behind = k - BESIDE, k + 1 + BESIDE
+    known = (before >= 0) & (behind <= last)
+    before, behind = np.clip(before, 0, last), np.clip(behind, 0, last)
+    width = np.where(known, back.bearings[behind] - back.bearings[before], np.nan)
+    return difference, (back.columns[behind] - back.columns[before]) / width[:, None]
