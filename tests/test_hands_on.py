@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_cli import Run, one_line, run
 from test_hardware_scan import HARDWARE, Head, head
@@ -92,11 +93,15 @@ def test_a_full_disk_and_a_weak_laser_are_faults(monkeypatch: pytest.MonkeyPatch
 
 
 def test_modes_are_tried_one_by_one(head: Head) -> None:
-    head.device.sizes, head.device.picture = ((640, 480), (1280, 720)), None
-    modes = probe_modes(0)
-    assert [mode.size for mode in modes] == [(640, 480), (1280, 720)]
-    for mode in modes:
-        assert mode.sends_jpeg and 20 < mode.rate_hz < 80
+    pictures = [0]
+
+    def send(size: tuple[int, int]) -> np.ndarray:
+        pictures[0] += 1
+        return np.zeros((size[1], size[0], 3), np.uint8)
+
+    head.device.sizes, head.device.picture, head.device.period_s = ((640, 480), (1280, 720)), send, 0.0
+    modes = probe_modes(0, clock=lambda: pictures[0] * 0.04)
+    assert [mode.words for mode in modes] == ["640x480 at 25/s JPEG", "1280x720 at 25/s JPEG"]
 
 
 # stage
