@@ -12,7 +12,7 @@ U8 = NDArray[np.uint8]
 
 SATURATED = 250  # [grey levels] from here on a sample says only "bright"
 # Pairs of rows that the laser's colour is measured on: more where few do not tell; and what does, in grey levels.
-_COLOUR_PAIRS = (12, 32)
+_COLOUR_PAIRS = (8, 32)
 _CLEAR_RATIO, _CLEAR = 2.5, 15.0
 _NARROW_PX, _BRIGHT_PX = (5, 160), (16, 40)  # distance of a line's sides: at least, and as a part of the width
 _BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two

@@ -83,7 +83,7 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     # A core with no flank in sight is wider than lines are; what bars are is judged elsewhere.
     seen = np.where(near < 1.0, 1.0, _UNTOLD).astype(np.float32)
     coloured = seen * np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
-    laser = _laser_share(candidates, share)
+    laser = _laser_share(candidates, share, shares)
     if laser is None or laser > _COLOURLESS_SHARE:
         doubt[block[at], which[at]] = coloured
         return doubt
@@ -215,8 +215,12 @@ def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
     return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
 
 
-def _laser_share(candidates: Candidates, share: F32) -> float | None:
+def _laser_share(candidates: Candidates, share: F32, settled: F32) -> float | None:
     """Height of the line in other channels over its own: the purest that enough connected candidates agree on."""
+    least = max(6.0, _CHAIN_SHARE * len(share))
+    sure = settled[~np.isnan(settled)]
+    if 2 * len(sure) > len(settled) and len(sure) > least:
+        return float(np.sort(sure)[int(least)])
     telling = np.isfinite(share) & (candidates.snr > _TELLING_SNR)
     # A candidate is part of a chain when the blocks above and below go on from it in place and colour.
     with np.errstate(invalid="ignore"):
@@ -230,7 +234,6 @@ def _laser_share(candidates: Candidates, share: F32) -> float | None:
         chained[1:-1] &= above[:-1] & below[1:]
         chained[0], chained[-1] = False, False
     shares = np.sort(share[chained])
-    least = max(6.0, _CHAIN_SHARE * len(share))
     if len(shares) < least:
         return None
     # The median of the purest part: as many candidates as a chain must have, twice over.

@@ -76,8 +76,9 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
     at = np.flatnonzero((jumpy[1:] | jumpy[:-1])[block])
     if at.size:
         padded = np.concatenate([[np.nan], path, [np.nan]])
-        for neighbour in (padded[:-2], padded[2:]):
-            rival, response = stand_out(plane, at, neighbour[block[at]], noise)
+        beside = np.concatenate([padded[:-2][block[at]], padded[2:][block[at]]])
+        rivals, responses = stand_out(plane, np.concatenate([at, at]), beside, noise)
+        for rival, response in zip(np.split(rivals, 2), np.split(responses, 2), strict=True):
             better = response > height_of_best[at] * 1.05
             best[at[better]], height_of_best[at[better]] = rival[better], response[better]
     found = np.flatnonzero((height_of_best > 0) & np.isfinite(window[:, 0]))

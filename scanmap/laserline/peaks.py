@@ -21,6 +21,7 @@ _SPECKLE_REACH = 5.0  # [sigma] under speckle the flanks say more than the core
 _SPECKLE_ROWS = 31  # rows over which the line's height is smoothed for a first model of its speckle
 _OFF_MOST = 1.2  # [px] from the middle of the window, and
 _NARROW_PX, _WIDEST = 0.75, 6.2  # the widths, the wider as a part of the window, at which sums are integrals
+_STRAY = 0.01  # share of the rows that is not worth another kind of step
 _DIM = 11.0  # heights, in noise, from whose first guess the way is too long for that
 _ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
 _CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
@@ -79,6 +80,8 @@ def fit_gaussian(
     part = np.flatnonzero(odd)
     # What is left of a clipped line needs more of its background to be told four parameters from.
     least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
+    if len(part) <= _STRAY * len(odd) and not cut.size:
+        part = part[:0]
     if part.size:
         fit = fit.with_rows(part, _fit_part(y[:, part], x, usable[:, part], start.of(part), least))
     look = _Look(y, x, fit)

@@ -20,7 +20,7 @@ REACH = 24  # [px] samples on either side of the column
 # Half of the fit's window, and the largest full width at half height it is for.
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
-_FEW = 24  # rows
+_FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
 
 
 class Samples(NamedTuple):
@@ -64,10 +64,11 @@ def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
     left = np.minimum((above[REACH::-1] + distance).min(axis=0), REACH + 1).astype(np.int16)
     right = np.minimum((above[REACH:] + distance).min(axis=0), REACH + 1)
     full = left + right - 1
-    if full.max() <= _WINDOWS[0][1]:
+    # A stray wide row or two are fitted with the others, a few with the widest.
+    wide = np.count_nonzero(full > _WINDOWS[0][1])
+    if wide <= _STRAY * len(full):
         return [(_WINDOWS[0][0], slice(None))]
-    # A few wide ones are fitted together.
-    few = np.count_nonzero(full > _WINDOWS[0][1]) < _FEW and full.max() > _WINDOWS[1][1]
+    few = wide < _FEW and full.max() > _WINDOWS[1][1]
     found, lower = [], -2
     for half, upper in (_WINDOWS[0], _WINDOWS[-1]) if few else _WINDOWS:
         rows = np.flatnonzero((full > lower) & (full <= upper))
