@@ -23,7 +23,7 @@ from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
-from scanmap.laserline.sight import Conversion, channel_of, sight_of
+from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
 
 Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -160,7 +160,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     noise = sight.noise
     course = search(sight, window, params.min_snr)
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
-    line = _located(sight.plane, sight.lit, (row, column), noise, params)
+    line = _located(sight, (row, column), params)
     _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
     line = _within(line, window)
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
@@ -168,7 +168,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     widest = _CORE_SHARE * line.width_px[wide]
     line = _lost(line, wide, Reason.WIDE)
     if params.method == "gauss" and at[0].size:
-        y, _ = samples_of(sight.lit, sight.plane, *at).of(_CORE_HALF, slice(None))
+        y, _ = samples_of(sight, *at).of(_CORE_HALF, slice(None))
         _take_cores(line, at, y.T, widest, noise, params)
     if sight.image is not None:
         pure = np.repeat(course.pure, BLOCK)[: len(image)]
@@ -187,13 +187,13 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     return line
 
 
-def _located(plane: U8, lit: U8, at: tuple[Index, Index], noise: float, params: LaserLineParams) -> LaserLine:
+def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> LaserLine:
     """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows."""
-    line = _nothing(len(plane), Reason.WEAK)
+    line, noise = _nothing(len(sight.lit), Reason.WEAK), sight.noise
     row, column = at
     if not row.size:
         return line
-    around = samples_of(lit, plane, row, column)
+    around = samples_of(sight, row, column)
     # Speckle is one for the frame; the largest group, which comes first, tells it best.
     contrast = {"auto": None, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
     for half, some in by_width(around.lit):

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.grey import NEIGHBOUR
 from scanmap.laserline.path import strips
+from scanmap.laserline.sight import Sight
 
 F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
@@ -20,6 +22,8 @@ REACH = 24  # [px] samples on either side of the column
 # Half of the fit's window, and the largest full width at half height it is for.
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
+# Share of the laser's own channel in the mixture, and of its light that a neighbouring channel sees.
+_OWN, _SHARE = 0.7, 0.12
 _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
 
 
@@ -28,6 +32,7 @@ class Samples(NamedTuple):
 
     lit: U8  # of the laser's light
     seen: U8  # of the picture, which says where it saturates
+    beside: U8 | None  # of the neighbouring channel, where it knows more of the place; else None
     outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
 
     def of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
@@ -35,20 +40,39 @@ class Samples(NamedTuple):
         span = slice(REACH - half, REACH + half + 1)
         y = self.lit[span, some].astype(np.float32)
         usable = self.seen[span, some] < SATURATED
+        if self.beside is not None:
+            y = _mixed(y, self.beside[span, some], usable)
         if self.outside is not None:
             usable &= ~self.outside[span, some]
         return y, usable.astype(np.float32)
 
 
-def samples_of(lit: U8, seen: U8, row: Index, column: Index) -> Samples:
-    """The samples around integer columns (N,) of rows (N,); planes (H, W) of the laser's light and as seen."""
+def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
+    """The samples around integer columns (N,) of rows (N,)."""
+    lit, seen = sight.lit, sight.plane
     y = strips(lit, row, column, REACH)
     bright = y if seen is lit else strips(seen, row, column, REACH)
-    outside = None
+    beside = outside = None
+    if sight.image is not None and sight.compressed:
+        beside = strips(sight.image[..., NEIGHBOUR[sight.channel]], row, column, REACH)
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
-    return Samples(y, bright, outside)
+    return Samples(y, bright, beside, outside)
+
+
+def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_]) -> F32:
+    """The laser's channel with the neighbouring one in it (n, N), as high as the laser's own; whole lines only.
+
+    Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
+    colour, which is smeared. Two channels together hold more of the one and less of the other.
+    """
+    mixed = own * np.float32(_OWN)
+    mixed += beside * np.float32(1.0 - _OWN)
+    mixed *= np.float32(1.0 / (_OWN + (1.0 - _OWN) * _SHARE))
+    cut = np.flatnonzero(~usable.all(axis=0))
+    mixed[:, cut] = own[:, cut]
+    return mixed
 
 
 def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:

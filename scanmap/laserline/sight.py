@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, is_large, noise_of
 from scanmap.laserline.channel import laser_channel
 from scanmap.laserline.colour import without_colour
-from scanmap.laserline.grey import CHANNEL, Grey, extract, to_grey, without_background
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
 
 U8 = NDArray[np.uint8]
+
+
+# Noise of the difference of two channels over that of one, from which on they are independent.
+_INDEPENDENT = 1.2
 
 
 class Conversion(NamedTuple):
@@ -35,6 +39,7 @@ class Sight(NamedTuple):
     image: U8 | None  # (H, W, 3) where colour tells the laser from other things
     channel: int  # of the image; -1 without one
     noise: float  # of a sample of lit [grey levels]
+    compressed: bool = False  # the channels of the image share their noise
 
 
 def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
@@ -49,7 +54,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
         rows = np.asarray(cv2.extractChannel(quick_rows(image), channel), np.uint8)
         # Most of a large picture is never looked at.
         plane = image[..., channel] if is_large(image) else extract(image, channel)
-        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows))
+        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows), _compressed(image, channel))
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off = None
     if background is not None:
@@ -75,3 +80,14 @@ def quick_rows(image: U8) -> U8:
 def _noise(plane: U8, rows: U8) -> float:
     # What is in the cache already, where it is enough.
     return noise_of(rows if is_large(plane) else plane)
+
+
+def _compressed(image: U8, channel: int) -> bool:
+    """Whether the noise of the picture's channels is one: it went through JPEG, or through a camera's own matrix.
+
+    Independent noises differ by more than each, by the root of two.
+    """
+    rows = np.ascontiguousarray(image[:: max(1, len(image) // 8)])
+    own, other = (np.asarray(cv2.extractChannel(rows, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
+    difference = np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8)
+    return noise_of(difference) < _INDEPENDENT * noise_of(other)
