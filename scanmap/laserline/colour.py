@@ -15,6 +15,7 @@ U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
+_GREY = 6  # [grey levels] what compression makes the channels of a grey picture differ by at most
 _COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
@@ -45,9 +46,13 @@ def blocks_of(image: U8, channel: int) -> U8:
 
 
 def without_colour(image: U8) -> bool:
-    """Whether the three channels of a picture (H, W, 3) are one."""
-    coarse = image[:: max(32, len(image) // 10), ::16].astype(np.int16)
-    return bool(np.abs(np.diff(coarse, axis=2)).mean() < 1.0)
+    """Whether the three channels of a picture (H, W, 3) are one.
+
+    Asked of whole rows: in a grey room the laser line is the only colour there is, a few pixels in a row.
+    """
+    blue, green, red = cv2.split(np.ascontiguousarray(image[:: max(1, len(image) // 16)]))
+    apart = np.asarray(cv2.max(cv2.absdiff(red, green), cv2.absdiff(green, blue)), np.uint8)
+    return bool(np.count_nonzero(apart.max(axis=1) > _GREY) <= 0.1 * len(apart))
 
 
 def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, shares: F32) -> F32:
