@@ -20,7 +20,7 @@ from scanmap.laserline.grey import Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
-from scanmap.laserline.pooling import pool
+from scanmap.laserline.pooling import pool, unexplained
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
 from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
@@ -43,6 +43,9 @@ _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 _WEAK_PX, _STANDS_OUT = 0.2, (2.5, 5.0)
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
+# Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
+# the sigmas to be believed, and may fall below them once they are known to be wrong.
+_APART_ROWS, _MORE, _LESS = (5, 6), 1.12, 0.5
 
 
 class Reason(IntEnum):
@@ -181,10 +184,23 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
         line = _lost(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
         weak |= height < _STANDS_OUT[1]
     line = _lost(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
-    if params.pool_rows >= 3:
-        pooled, sigma = pool(line.column_px, line.sigma_px, params.pool_rows)
-        line = line._replace(column_px=pooled, sigma_px=sigma)
-    return line
+    return _pooled(line, params.pool_rows)
+
+
+def _pooled(line: LaserLine, rows: int) -> LaserLine:
+    """The line with sigmas that the scatter along it bears out, and pooled over so many rows (3 or more)."""
+    more = unexplained(line.column_px, line.sigma_px, _APART_ROWS)
+    correlated = more > _MORE
+    if correlated:
+        line.sigma_px[:] *= more
+    if rows < 3:
+        return line
+    pooled, sigma = pool(line.column_px, line.sigma_px, rows)
+    # Errors that are alike in neighbouring rows do not average out as others do.
+    more = unexplained(pooled, sigma, (rows + 1,))
+    if correlated or more > _MORE:
+        sigma *= max(more, _LESS)
+    return line._replace(column_px=pooled, sigma_px=sigma)
 
 
 def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> LaserLine:

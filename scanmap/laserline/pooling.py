@@ -16,6 +16,8 @@ _MISFIT = 4.5
 # Chi^2 of a bend that is kept by half; share of a bend's variance that remains when nothing of it is kept.
 _BEND_DOUBT, _BEND_LEAST = 2.0, 0.5
 
+_TELLING = 150  # rows that tell whether sigma is too small
+
 
 def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
     """Columns and sigmas (H,) after a weighted quadratic over at most `support` rows of one segment.
@@ -45,6 +47,36 @@ def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
         out_column[good_at], out_sigma[good_at] = fitted[good], spread[good]
         pending[good_at] = False
     return out_column, out_sigma
+
+
+def unexplained(column: Array, sigma: Array, lags: tuple[int, ...]) -> float:
+    """How much more (or less) the columns of a line scatter than their sigmas say, as a factor; 1 where too few tell.
+
+    Args:
+        column: (H,) NaN where a row has no line.
+        sigma: (H,) standard deviations.
+        lags: rows so far apart that their errors have little to do with each other.
+
+    What JPEG's blocks and a camera's sharpening do to a line looks like a line moved: a row's own samples cannot tell.
+    Other rows can: fourth differences of a line are zero on every surface bent no more than a cubic, and 70 variances
+    of noise. The median of all rows counts, so that edges do not.
+    """
+    start, _ = _segments(column, sigma)
+    variance = np.square(sigma)
+    squares = []
+    for lag in lags:
+        span = 4 * lag
+        if len(column) <= span:
+            return 1.0
+        at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))
+        if len(at) < _TELLING:
+            return 1.0
+        a, b, c, d, e = (column[at + k * lag] for k in range(5))
+        va, vb, vc, vd, ve = (variance[at + k * lag] for k in range(5))
+        step = a + e - 4.0 * (b + d) + 6.0 * c
+        ratio = np.sort(step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc))
+        squares.append(float(ratio[len(ratio) // 2]) / 0.455)  # the median of chi^2 with one degree of freedom
+    return float(np.sqrt(np.mean(squares)))
 
 
 def _segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
