@@ -24,6 +24,13 @@ from scanmap.rig.camera_stream import BLACK_SHOTS, StreamCamera
 from scanmap.shot import decode_image, encode_png, image_format
 
 
+@pytest.fixture(autouse=True)
+def warm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test waits for a lamp."""
+    for name in ("WARM_UP_S", "AUTOMATIC_WARM_UP_S", "FOLLOW_S"):
+        monkeypatch.setattr(f"scanmap.rig.camera_stream.{name}", 0.0)
+
+
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> FakeDevice:
     device = FakeDevice()
@@ -248,6 +255,33 @@ def test_automatic_exposure_is_said(device: FakeDevice, caplog: pytest.LogCaptur
 def test_the_calibrations_size_is_asked_for(device: FakeDevice) -> None:
     with opened(CameraParams(source=0), (128, 96)) as camera:
         assert (camera.width, camera.height) == (128, 96)
+
+
+def test_the_exposure_can_be_changed_while_it_runs(
+    device: FakeDevice, monkeypatch: pytest.MonkeyPatch, frames: Callable[[], bytes]
+) -> None:
+    monkeypatch.setattr("scanmap.rig.camera_stream.FOLLOW_S", 0.1)
+    with opened(CameraParams(source=0, latency_s=0.0, exposure_us=4000)) as camera:
+        camera.grab()
+        asked = time.monotonic()
+        camera.expose(20000)
+        assert camera.grab().time > asked + 0.1
+        assert device.controls[cv2.CAP_PROP_EXPOSURE] == 200
+    with (
+        phone(frames) as served,
+        opened(CameraParams(source=served.url + "/video", latency_s=0.0)) as camera,
+        pytest.raises(CameraError, match="cannot be set from here"),
+    ):
+        camera.expose(1000)
+
+
+def test_pictures_of_a_camera_that_has_just_started_are_not_shot(
+    device: FakeDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scanmap.rig.camera_stream.AUTOMATIC_WARM_UP_S", 0.3)
+    with opened(CameraParams(source=0, latency_s=0.0)) as camera:
+        started = time.monotonic()
+        assert camera.grab().time > started + 0.25
 
 
 # Faults

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from scanmap.errors import CalibrationError, CameraError, ConfigError, StageErro
 from scanmap.recording import open_source
 from scanmap.rig import grbl as grbl_module
 from scanmap.session.rigs import open_rig
+from scanmap.shot import decode_image
+from scanmap.sweep import SweepParams, plan, sweep
 from scanmap.twin import Truth, TwinCamera, build_scene
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import pty_port
@@ -51,6 +54,8 @@ def head(monkeypatch: pytest.MonkeyPatch) -> Head:
     fake = lambda target, *rest: FakeCapture(head.device) if target == 0 else real(target, *rest)  # noqa: E731
     monkeypatch.setattr(cv2, "VideoCapture", fake)
     monkeypatch.setattr(grbl_module, "BOOT_S", 0.1)
+    for name in ("WARM_UP_S", "AUTOMATIC_WARM_UP_S", "FOLLOW_S"):
+        monkeypatch.setattr(f"scanmap.rig.camera_stream.{name}", 0.0)
     return head
 
 
@@ -125,3 +130,48 @@ def test_replay_only_is_no_rig() -> None:
     config = configuration.load("srv-turntable")
     with pytest.raises(ConfigError, match=r"replay-only.*hardware"):
         open_rig(config, config.head())
+
+
+def test_a_continuous_sweep_of_hardware_knows_every_bearing(head: Head) -> None:
+    """Board and camera in real time, the camera 60 ms late: each picture tells by itself where it was exposed."""
+    head.board = Firmware(instant=False)
+    head.device.picture = lambda size: np.full(
+        (size[1], size[0], 3), round(math.degrees(head.board.bearing) * 5), np.uint8
+    )
+    head.device.latency_s, head.device.period_s, head.device.sends_jpeg = 0.06, 0.02, False
+    changes = ("sweep.mode=continuous", "sweep.end_deg=20", "sweep.speed_deg_s=10", "sweep.step_deg=0.5")
+    with pty_port(head.board) as url:
+        settings = (*HARDWARE, *changes, f"stage.port={url}", "camera.latency_s=0.06", "stage.acceleration_deg_s2=200")
+        config = configuration.load("twin-room", settings)
+        opened = open_rig(config, config.head())
+        shots = list(sweep(opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock))
+        opened.close()
+    bearings = np.degrees([shot.bearing for shot in shots])
+    seen = np.array([decode_image(shot.image).image[0, 0, 0] / 5 for shot in shots])
+    assert len(shots) > 10 and np.ptp(bearings) > 12
+    # Late by 60 ms at 10 deg/s is 0.6 deg; a grey level is 0.2.
+    assert abs(np.median(bearings - seen)) < 0.25
+    assert not head.board.laser_on
+
+
+def test_every_pass_has_its_exposure_and_each_row_the_better_picture(tmp_path: Path) -> None:
+    """A dark room scanned bright and dim: the bright pass finds what the dim one misses, and both are kept."""
+    base = ("calibration.image.width=320", "calibration.image.height=240", "sweep.end_deg=40", "sweep.step_deg=10",
+            "twin.laser.white_wall_peak=0.05")  # fmt: skip
+
+    def scanned(*more: str) -> session.Result:
+        choice = session.Choice("twin-room", (*base, *more))
+        outputs = session.Outputs(record=tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap")
+        with session.prepare_scan(choice, outputs, view=False) as job:
+            return job.run(lambda _: None, lambda: False)
+
+    dim, both = scanned(), scanned("sweep.exposures_us=[5000, 40000]")
+    assert both.shots == 2 * dim.shots and len(both.scan.bearings) == len(dim.scan.bearings)
+    assert both.summary.points > 1.05 * dim.summary.points
+    assert both.truth is not None and dim.truth is not None
+    assert both.truth.median_m < 0.8 * dim.truth.median_m
+    levels = [decode_image(shot.image, grey=True).image.mean() for shot in open_source(tmp_path / "1.mcap").shots()]
+    assert min(levels[5:]) > 2 * max(levels[:5])
+    assert plan(SweepParams(exposures_us=(1.0, 2.0))).words.count("each with 2 exposures") == 1
+    with pytest.raises(ConfigError, match="exclude each other"):
+        plan(SweepParams(exposures_us=(1.0,), mode="adaptive"))

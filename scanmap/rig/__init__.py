@@ -53,6 +53,19 @@ class Streaming(Protocol):
         ...
 
 
+@runtime_checkable
+class Exposing(Protocol):
+    """A camera whose exposure can be changed while it runs."""
+
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from the next picture on [us].
+
+        Raises:
+            CameraError: it cannot.
+        """
+        ...
+
+
 class Stage(Protocol):
     """Turns the head and switches the laser."""
 

@@ -88,6 +88,14 @@ class CapturedPictures:
             )
         return Picture(_as_sent(np.asarray(pixels, np.uint8)), self._stamp(arrival))
 
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from now on [us]; what is refused is a warning."""
+        self._params = self._params.model_copy(update={"exposure_us": exposure_us})
+        if self._capture is not None:
+            only = CameraParams(source=self._params.source, exposure_us=exposure_us)
+            for refusal in _ask_for_controls(self._capture, only):
+                logger.warning("camera %s: %s", self.name, refusal)
+
     def close(self) -> None:
         """Free the device; may be called twice."""
         if self._capture is not None:

@@ -7,13 +7,14 @@ shot is decided by time stamps, not by throwing a number of pictures away.
 from __future__ import annotations
 
 import logging
+import math
 import statistics
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from scanmap.errors import CameraError
 from scanmap.rig import Frame
@@ -23,6 +24,8 @@ from scanmap.shot import Image, encode_png
 
 OPENING_S = 8.0  # a webcam may take this long to its first picture
 REOPEN_S = 0.5  # between two attempts to get a lost camera back
+WARM_UP_S, AUTOMATIC_WARM_UP_S = 0.5, 1.5  # pictures of a camera that has just started are dark or green
+FOLLOW_S = 0.6  # a webcam shows a new exposure some pictures later
 LEAVE_S = 2.0  # how long a thread may take to notice that it is to end
 PERIODS = 15  # pictures whose distance in time is remembered
 BLACK_TRIES = 2  # a black picture among others is a slip of the camera: the next ones are looked at first
@@ -59,6 +62,15 @@ class PictureSource(Protocol):
         ...
 
 
+@runtime_checkable
+class ExposingSource(Protocol):
+    """A source whose exposure can be set."""
+
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from now on [us]; called by the thread that reads."""
+        ...
+
+
 class StreamCamera:
     """A camera behind a thread. Implements `scanmap.rig.Camera` and `scanmap.rig.Streaming`."""
 
@@ -83,11 +95,15 @@ class StreamCamera:
         self._last_print: int | None = None
         self._black_shots = 0
         self._size: Size | None = None
+        self._wanted_us: float | None = None  # an exposure that the thread is to set
+        self._steady_from = -math.inf  # [s] no picture exposed before is good for a shot
         self._thread = threading.Thread(target=self._read_on, name=f"camera {source.name}", daemon=True)
         source.open()
         self._thread.start()
         try:
             self._size = self._first_size()
+            if params.kind == "device":
+                self._steady_from = clock() + (WARM_UP_S if params.exposure_us else AUTOMATIC_WARM_UP_S)
         except BaseException:
             self.close()
             raise
@@ -125,7 +141,7 @@ class StreamCamera:
         Raises:
             CameraError: none came in time, or it is cut, damaged, of another size, black, or the old one again.
         """
-        asked = self._clock()
+        asked = max(self._clock(), self._steady_from)
         latency = self._params.latency
         # The latency counts from the middle of the exposure, which lasts a period at most.
         exposure_s = (self._params.exposure_us or 1e6 * (self.period_s or 1 / 30)) * 1e-6
@@ -145,6 +161,21 @@ class StreamCamera:
                 "camera.exposure_us higher"
             )
         return Frame(data, stamp - latency)
+
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from now on [us]; the next shot waits until the camera has followed.
+
+        Raises:
+            CameraError: this source cannot.
+        """
+        if not isinstance(self._source, ExposingSource) or self._params.kind != "device":
+            raise CameraError(
+                f"the exposure of camera {self.name} cannot be set from here: leave sweep.exposures_us empty"
+            )
+        with self._news:
+            self._params = self._params.model_copy(update={"exposure_us": exposure_us})
+            self._wanted_us = exposure_us
+            self._steady_from = self._clock() + FOLLOW_S
 
     def newest(self) -> Frame:
         """The newest picture that was not handed out yet; only its header is looked at.
@@ -240,6 +271,9 @@ class StreamCamera:
                 if not is_open:
                     self._source.open()
                     is_open = True
+                if self._wanted_us is not None and isinstance(self._source, ExposingSource):
+                    wanted, self._wanted_us = self._wanted_us, None
+                    self._source.expose(wanted)
                 picture = self._source.read()
             except CameraError as error:
                 self._source.close()

@@ -135,6 +135,8 @@ def open_twin(config: Config, calibration: Calibration) -> OpenRig:
             corrected_s=config.camera.latency_s or 0.0,
             rng=np.random.default_rng([config.twin.seed, 1]),
         )
+        if config.camera.exposure_us is not None:
+            delayed.expose(config.camera.exposure_us)
         return OpenRig(
             Rig(delayed, stage, TWIN_NAME, is_twin=True),
             firmware.wait,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,12 @@ class SweepParams(BaseModel, frozen=True, extra="forbid"):
     step_deg: float = Field(1.0, gt=0.0, le=360.0, description="from one bearing to the next [deg]")
     passes: Literal["forward", "forward-backward"] | int = Field(
         "forward", description="forward, forward-backward, or a number of passes in turn"
+    )
+    exposures_us: tuple[Annotated[float, Field(gt=0.0, le=1e7)], ...] = Field(
+        (),
+        max_length=8,
+        description="every pass is made once with each of these exposures, for rooms both dark and shiny; each row "
+        "then comes from the picture that knows it best; empty = camera.exposure_us [us]",
     )
     speed_deg_s: float = Field(6.0, gt=0.0, le=720.0, description="continuous: turning speed [deg/s]")
     latency_s: float = Field(
@@ -58,6 +64,15 @@ class Plan(NamedTuple):
     time_s: float  # estimate of the whole sweep [s]
     params: SweepParams  # what it was made from
 
+    def exposure_us(self, number: int) -> float | None:
+        """Exposure of the pass with this number [us]; None = as the camera has it."""
+        exposures = self.params.exposures_us
+        return exposures[number % len(exposures)] if exposures else None
+
+    def pass_of(self, index: int) -> int:
+        """Number of the pass that shot `index` belongs to."""
+        return index // len(np.unique(self.bearings))
+
     @property
     def words(self) -> str:
         """One line for people."""
@@ -83,6 +98,8 @@ class Plan(NamedTuple):
             if sweep.passes == 1
             else f"{sweep.passes} passes"
         )
+        if sweep.exposures_us:
+            passes += f", each with {len(sweep.exposures_us)} exposures"
         return f"{len(self.bearings)} bearings {span} every {sweep.step_deg:g} deg, {passes}"
 
     def as_metadata(self) -> dict[str, str]:
@@ -123,6 +140,11 @@ def plan(params: SweepParams, limits: tuple[float, float] = CABLE_LIMITS) -> Pla
         raise ConfigError(
             f"sweep.passes = {params.passes!r}: choose forward, forward-backward or a number from 1 "
             f"to {MAX_BEARINGS // count}"
+        )
+    passes *= max(1, len(params.exposures_us))
+    if params.exposures_us and params.mode == "adaptive":
+        raise ConfigError(
+            "sweep.exposures_us and sweep.mode = 'adaptive' exclude each other; choose step or continuous"
         )
     bearings = np.concatenate([forward if number % 2 == 0 else forward[::-1] for number in range(passes)])
     turning = float(np.abs(np.diff(bearings)).sum())

@@ -10,8 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.errors import CameraError, StageError
-from scanmap.rig import Camera, Frame, Rig, Streaming
+from scanmap.errors import CameraError, ConfigError, StageError
+from scanmap.rig import Camera, Exposing, Frame, Rig, Streaming
 from scanmap.shot import Shot
 from scanmap.sweep.planning import Plan
 from scanmap.sweep.watching import Doubt, Watch
@@ -48,6 +48,7 @@ class Steps:
         self._sleep = sleep
         self._watch = watch
         self._rehomings_left = planned.params.rehomings
+        self._exposure_us: float | None = None  # as last asked for
 
     def shots(self, stop: Callable[[], bool], refine: Refine | None, done: Collection[int]) -> Iterator[Shot]:
         """Every shot of the plan but those `done`; then what `refine` asks for, on the way back."""
@@ -84,6 +85,7 @@ class Steps:
                 reported = self._rig.stage.move_to(bearing)
                 if self._params.settle_s:
                     self._sleep(self._params.settle_s)
+                self._expose(index)
                 frame, background = self._take()
                 after = self._rig.stage.where()
                 if abs(after - reported) > STILL_RAD:
@@ -155,6 +157,13 @@ class Steps:
         logger.warning("%s; homing again (%d more times at most)", error, self._rehomings_left)
         stage.home()
 
+    def _expose(self, index: int) -> None:
+        """Change the exposure where another pass begins."""
+        wanted = self._planned.exposure_us(self._planned.pass_of(index))
+        if wanted is not None and wanted != self._exposure_us:
+            expose(self._rig.camera, wanted)
+            self._exposure_us = wanted
+
     def _take(self) -> tuple[Frame, bytes | None]:
         """A frame with the laser on and, if asked for and possible, one with it off, taken just before."""
         stage, retries, background = self._rig.stage, self._params.retries, None
@@ -163,6 +172,18 @@ class Steps:
             background = grab(self._rig.camera, retries).image
         stage.laser(True)
         return grab(self._rig.camera, retries), background
+
+
+def expose(camera: Camera, exposure_us: float) -> None:
+    """Change the exposure of a camera.
+
+    Raises:
+        ConfigError: this kind of camera cannot do that.
+        CameraError: it refused.
+    """
+    if not isinstance(camera, Exposing):
+        raise ConfigError("sweep.exposures_us needs a camera whose exposure can be set: a USB webcam, or the twin")
+    camera.expose(exposure_us)
 
 
 def grab(camera: Camera, retries: int, *, moving: bool = False) -> Frame:

@@ -19,7 +19,7 @@ from scanmap.errors import ConfigError, ScanmapError
 from scanmap.rig import Rig
 from scanmap.shot import Shot
 from scanmap.sweep.planning import CABLE_LIMITS, Plan, SweepParams, plan
-from scanmap.sweep.stepping import Refine, Steps, grab
+from scanmap.sweep.stepping import Refine, Steps, expose, grab
 from scanmap.sweep.watching import Watch
 
 HISTORY = 100  # reports kept for frames that arrive late
@@ -113,8 +113,10 @@ def _turn(
     speed = math.radians(params.speed_deg_s)
     count = len(np.unique(planned.bearings))
     index = 0
-    for start, end in planned.bearings.reshape(-1, count)[:, [0, -1]].tolist():
+    for number, (start, end) in enumerate(planned.bearings.reshape(-1, count)[:, [0, -1]].tolist()):
         rig.stage.move_to(start)
+        if (exposure_us := planned.exposure_us(number)) is not None:
+            expose(rig.camera, exposure_us)
         rig.stage.laser(True)
         track = [_sample(rig, clock)]
         stage.start_turn(end, speed)

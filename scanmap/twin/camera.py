@@ -37,6 +37,9 @@ class TwinParams(RoomParams, frozen=True, extra="forbid"):
         0.0, ge=0.0, le=5.0, description="how much later than its exposure a picture is stamped [s]"
     )
     jitter_s: float = Field(0.0, ge=0.0, le=1.0, description="standard deviation of that [s]")
+    exposure_us: float = Field(
+        5000.0, gt=0.0, le=1e7, description="exposure at which light and laser are as bright as they say [us]"
+    )
     light: LightParams = LightParams()
     laser: LaserParams = LaserParams()
     sensor: SensorParams = SensorParams()
@@ -89,6 +92,7 @@ class TwinCamera:
         self._coarse_rays = self._rays(*_grid(own.width, own.height, *self._coarse_size))
         self._fine_rays = self._rays(*_grid(own.width, own.height, own.width, own.height))
         self._backdrop: _Backdrop | None = None
+        self._gain = np.float32(1.0)  # of the exposure, against the one that everything is given for
 
     @property
     def width(self) -> int:
@@ -118,6 +122,11 @@ class TwinCamera:
         """Go on as after one picture with the laser off and one with it on at each of these true `bearings` [rad]."""
         self._visits = Counter((bearing, on) for bearing in bearings for on in (True, False))
 
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from the next picture on [us]."""
+        self._gain = np.float32(exposure_us / self._params.exposure_us)
+        self._backdrop = None
+
     def close(self) -> None:
         """Free nothing: there is no device."""
 
@@ -138,7 +147,7 @@ class TwinCamera:
         T_world_head = self._calibration.mount.T_world_head(bearing)
         origin = transform(T_world_head, self._calibration.T_head_camera[:3, 3])
         R = T_world_head[:3, :3].astype(np.float32)
-        through = self._params.sensor.filter_rgb
+        through = self._params.sensor.filter_rgb * self._gain
         coarse_shape = (self._coarse_size[1], self._coarse_size[0], 3)
         light = (self._scene.radiance(origin, _turned(self._coarse_rays, R)) * through).reshape(coarse_shape)
         glare = self._params.sensor.glare * _blurred(light, self._params.sensor.glare_px / COARSE)
@@ -160,7 +169,7 @@ class TwinCamera:
         """Add the laser's light to a coded picture, with speckle and glare."""
         if not line.light.size:
             return
-        light = line.light * self._params.sensor.filter_rgb
+        light = line.light * (self._params.sensor.filter_rgb * self._gain)
         if self._params.laser.speckle > 0:
             y, x = rng.integers(0, self._speckle.shape[0] - self.height + 1), rng.integers(0, 64)
             columns = (np.arange(light.shape[1]) + x) % self._speckle.shape[1]

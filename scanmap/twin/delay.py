@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scanmap.rig import Camera, Frame
+from scanmap.errors import CameraError
+from scanmap.rig import Camera, Exposing, Frame
 
 
 class DelayedCamera:
@@ -71,6 +72,17 @@ class DelayedCamera:
             self._coming.append(Frame(frame.image, frame.time + self._delay()))
         image, arrival = self._coming.popleft()
         return Frame(image, arrival - self._corrected_s)
+
+    def expose(self, exposure_us: float) -> None:
+        """Expose so long from the next picture on [us]; pictures still on their way are dropped.
+
+        Raises:
+            CameraError: the camera cannot.
+        """
+        if not isinstance(self._camera, Exposing):
+            raise CameraError("the exposure of this camera cannot be set")
+        self._coming.clear()
+        self._camera.expose(exposure_us)
 
     def close(self) -> None:
         """Free the camera; may be called twice."""
