@@ -1,0 +1,85 @@
+"""The laser line in pictures as cameras send them: JPEG, with colour at half the columns or less."""
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_lines import GREEN, RED, LineSpec, clean
+
+from scanmap.laserline import LaserLineParams, find_laser_line
+from scanmap.laserline.colour import without_colour
+
+ALONE, POOLED = LaserLineParams(), LaserLineParams(pool_rows=9)
+SUBSAMPLING = {
+    "422": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422,
+    "420": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+    "444": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+}
+
+
+def compressed(image, quality, subsampling="422"):
+    """The picture after JPEG."""
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, SUBSAMPLING[subsampling]]
+    return cv2.imdecode(cv2.imencode(".jpg", image, how)[1], cv2.IMREAD_UNCHANGED)
+
+
+def errors(spec, params, quality, subsampling, seeds=range(2)):
+    """Errors [px] and errors over sigma_px of all rows."""
+    off, scaled = [], []
+    for seed in seeds:
+        image, truth = clean(spec, np.random.default_rng(seed))
+        line = find_laser_line(compressed(image, quality, subsampling), params)
+        off.append(line.column_px - truth)
+        scaled.append(off[-1] / line.sigma_px)
+    return np.concatenate(off), np.concatenate(scaled)
+
+
+@pytest.mark.parametrize(
+    ("colour", "quality", "subsampling", "peak", "limit"),
+    [  # limits: RMS pooled [px]; of the laser's own channel alone, without the neighbouring one, 1.3 to 2 times that
+        (RED, 85, "422", 200.0, 0.035),
+        (RED, 85, "420", 200.0, 0.045),
+        (RED, 92, "422", 60.0, 0.065),
+        (GREEN, 85, "422", 200.0, 0.020),
+        (RED, 95, "444", 200.0, 0.014),
+        (None, 85, "422", 60.0, 0.040),
+    ],
+)
+def test_sigma_is_honest_and_pooling_pays_in_a_jpeg(colour, quality, subsampling, peak, limit):
+    spec = LineSpec(colour=colour, peak=peak)
+    alone, scaled = errors(spec, ALONE, quality, subsampling)
+    assert np.isfinite(alone).mean() >= 0.999
+    assert 0.8 <= np.nanstd(scaled) <= 1.2
+    pooled, scaled = errors(spec, POOLED, quality, subsampling)
+    assert np.sqrt(np.nanmean(pooled**2)) <= min(limit, 0.7 * np.sqrt(np.nanmean(alone**2)))
+    assert 0.8 <= np.nanstd(scaled) <= 1.2
+
+
+@pytest.mark.parametrize("laser", [RED, GREEN], ids=["red", "green"])
+def test_a_line_is_seen_in_its_own_colour_in_a_grey_room(laser):
+    """Compressed, an even grey room has no trace of colour but the line."""
+    image, truth = clean(LineSpec(colour=laser, noise=1.0), np.random.default_rng(0))
+    picture = compressed(image, 85)
+    assert not without_colour(picture)
+    line = find_laser_line(picture, ALONE)
+    assert np.median(line.peak) > 150.0
+    assert np.sqrt(np.nanmean((line.column_px - truth) ** 2)) < 0.1
+
+
+def test_a_grey_picture_in_three_channels_is_told_from_colour():
+    image, _ = clean(LineSpec(height=600, width=800), np.random.default_rng(0))
+    picture = compressed(np.repeat(image[..., None], 3, axis=2), 85)
+    assert without_colour(picture)
+    found = find_laser_line(picture, ALONE).column_px
+    np.testing.assert_allclose(found, find_laser_line(np.ascontiguousarray(picture[..., 1]), ALONE).column_px)
+
+
+def test_a_turned_picture_gives_the_line_of_its_copy():
+    """Pictures whose rows are another's columns lie otherwise in memory."""
+    image, _ = clean(LineSpec(height=400, width=640, colour=RED), np.random.default_rng(0))
+    turned = np.ascontiguousarray(image.transpose(1, 0, 2)).transpose(1, 0, 2)
+    for view in (turned, image[:, ::-1][:, ::-1]):
+        np.testing.assert_array_equal(find_laser_line(view, POOLED).column_px, find_laser_line(image, POOLED).column_px)
+    mirrored = image[:, ::-1]
+    np.testing.assert_array_equal(
+        find_laser_line(mirrored, POOLED).column_px, find_laser_line(np.ascontiguousarray(mirrored), POOLED).column_px
+    )
