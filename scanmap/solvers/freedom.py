@@ -1,0 +1,107 @@
+"""What may move in a head: named small changes of laser plane and mount, and which of them flatness can see.
+
+Flat walls stay flat when the whole scan is scaled, turned about the axis or lifted along it. So of the seven ways in
+which laser plane and axis can stand to the camera, flatness sees six; the seventh, scale, must be held by a length
+that is known: the baseline, or the axis's distance from the head.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.calibration import Calibration
+from scanmap.geometry import HeadMount, inverse, rigid, rotation_z
+
+Array = NDArray[np.float64]
+Scale = Literal["baseline", "axis"]
+
+# Changes: the plane turned by yaw and roll about the camera's centre [rad] and moved away from it [m]; the head's
+# offset from the axis [m]; the axis's tilt [rad].
+NAMES = ("yaw", "roll", "distance", "offset_x", "offset_y", "tilt_x", "tilt_y")
+FREE: dict[Scale, tuple[str, ...]] = {
+    "baseline": ("yaw", "roll", "offset_x", "offset_y", "tilt_x", "tilt_y"),
+    "axis": ("yaw", "roll", "distance"),
+}
+# How well a head is known before, by ruler and printed parts (one standard deviation); what a scan cannot see stays.
+RULER: dict[Scale, dict[str, float]] = {
+    "baseline": {
+        "yaw": np.radians(1.0), "roll": np.radians(0.3), "offset_x": 0.03, "offset_y": 0.015,
+        "tilt_x": np.radians(0.3), "tilt_y": np.radians(0.3),
+    },
+    "axis": {"yaw": np.radians(1.0), "roll": np.radians(1.0), "distance": 0.01},
+}  # fmt: skip
+
+
+def longer_length(calibration: Calibration) -> Scale:
+    """Which of a head's two lengths holds the scale: the longer, for the same ruler measures it better."""
+    return "axis" if np.hypot(*calibration.mount.offset_m[:2]) > calibration.baseline_m else "baseline"
+
+
+def tangents(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors (3,) across a plane's normal: yaw turns it along the first, roll along the second."""
+    up = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.95 else np.array([1.0, 0.0, 0.0])
+    first = np.cross(normal, up)
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def changed(calibration: Calibration, names: Sequence[str], values: Array) -> Calibration:
+    """The head with some of `NAMES` changed; its camera stays where it is, laser plane and mount move."""
+    change = dict.fromkeys(NAMES, 0.0) | dict(zip(names, map(float, values), strict=True))
+    normal, centre = calibration.laser_plane[:3], calibration.T_head_camera[:3, 3]
+    away = normal @ centre + calibration.laser_plane[3] + change["distance"]
+    first, second = tangents(normal)
+    turned = normal + change["yaw"] * first + change["roll"] * second
+    turned /= np.linalg.norm(turned)
+    (x, y, z), (tilt_x, tilt_y) = calibration.mount
+    mount = HeadMount(
+        (x + change["offset_x"], y + change["offset_y"], z),
+        (tilt_x + float(np.degrees(change["tilt_x"])), tilt_y + float(np.degrees(change["tilt_y"]))),
+    )
+    return replace(calibration, laser_plane=np.append(turned, away - turned @ centre), mount=mount)
+
+
+def redrawn(calibration: Calibration, laser_plane: Array) -> Calibration:
+    """The same head with its frame drawn so that its laser plane is `laser_plane`: the camera turns instead.
+
+    The plane must be as far from the camera as its own. World heights and directions that nothing can observe (along
+    the axis and about it) stay as they are.
+    """
+    centre = calibration.T_head_camera[:3, 3]
+    T_new_old = _turn_about(centre, calibration.laser_plane[:3], laser_plane[:3])
+    T_axis_new = calibration.mount.T_axis_head() @ inverse(T_new_old)
+    R = T_axis_new[:3, :3]
+    tilt_x, tilt_y = np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(np.clip(R[2, 0], -1.0, 1.0))
+    # What is left is a turn about the axis: bearing zero, which no scan knows.
+    x, y, _ = rotation_z(-float(np.arctan2(R[1, 0], R[0, 0]))) @ T_axis_new[:3, 3]
+    mount = HeadMount(
+        (float(x), float(y), calibration.mount.offset_m[2]), (float(np.degrees(tilt_x)), float(np.degrees(tilt_y)))
+    )
+    return replace(
+        calibration, T_head_camera=T_new_old @ calibration.T_head_camera, laser_plane=laser_plane.copy(), mount=mount
+    )
+
+
+def plane_slope(calibration: Calibration, names: Sequence[str]) -> Array:
+    """Derivative (4, N) of the laser plane by the changes `names`."""
+    normal, centre = calibration.laser_plane[:3], calibration.T_head_camera[:3, 3]
+    first, second = tangents(normal)
+    columns = {
+        "yaw": np.append(first, -first @ centre),
+        "roll": np.append(second, -second @ centre),
+        "distance": np.array([0.0, 0.0, 0.0, 1.0]),
+    }
+    return np.stack([columns.get(name, np.zeros(4)) for name in names], axis=1)
+
+
+def _turn_about(centre: Array, source: Array, target: Array) -> Array:
+    """(4, 4) smallest turn about a point that brings one unit vector onto another (Rodrigues)."""
+    axis, cosine = np.cross(source, target), float(source @ target)
+    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    R = np.eye(3) + K + K @ K / (1.0 + cosine)
+    return rigid(R, centre - R @ centre)
