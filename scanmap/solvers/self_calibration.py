@@ -69,13 +69,14 @@ class Refined:
         return next(e for e in self.estimates if e.name == name)
 
 
-def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None) -> Refined:
+def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *, any_gain: bool = False) -> Refined:
     """Refine a head from the laser lines of one scan of a room, or of a block on a turntable.
 
     Args:
         lines: of all shots, laser on anything flat.
         calibration: the head as it is known; its intrinsics stay.
         scale: the length that holds the scale; the longer one if left out.
+        any_gain: give the result even where the head was as good before.
 
     Raises:
         CalibrationError: the scan cannot tell (too few bearings or flat pieces, walls that leave it open), or what it
@@ -102,7 +103,7 @@ def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None) -
         problem = _Problem.of(sight, segments, calibration, free, ruler)
         change, covariance = problem.solve(change)
         tolerance = max(0.5 * tolerance, min(5.0 * segments.noise_px, tolerance))
-    return _judged(_Outcome(calibration, scale, free, ruler, change, covariance), problem, segments, patches)
+    return _judged(_Outcome(calibration, scale, free, ruler, change, covariance), problem, segments, patches, any_gain)
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def _leans(wall: Array, floor: Array) -> Array:
     return left
 
 
-def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: Patches) -> Refined:
+def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: Patches, any_gain: bool) -> Refined:
     """The result, or why there is none."""
     sigma = np.sqrt(np.diag(outcome.covariance))
     estimates = tuple(
@@ -255,7 +256,7 @@ def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: P
             "this calibration, or the scan has hardly a flat wall. Calibrate with a board; nothing is written"
         )
     before, after = (_rms(problem.residual(x)[0]) for x in (np.zeros(len(outcome.change)), outcome.change))
-    if not after <= before:
+    if not after <= before and not any_gain:
         raise CalibrationError(
             f"nothing to gain: flat pieces deviate by {before:.3f} px as it is and {after:.3f} px after; nothing is "
             "written"

@@ -1,0 +1,365 @@
+"""Is a calibration as good as it says? A scan of a room judged by its flat walls, its corners and its own passes.
+
+A wall is a piece that is flat under the calibration that self-calibration would make of this scan; so what it deviates
+by under the calibration that is judged is the calibration's doing, not the room's. It may deviate by what was promised
+there: the line's noise and shared error, the calibration's covariance, and a wall's own flatness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from scanmap.calibration import Calibration
+from scanmap.calibration.uncertainty import Uncertainty, moved, uncertainty_of
+from scanmap.errors import CalibrationError
+from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, beside, fitted_plane, grow
+from scanmap.solvers.self_calibration import Estimate, Refined, refine
+from scanmap.solvers.sight import Lines, Patches, Sight, located, patches_of, sight_of
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# How many standard deviations a measured value may be from what was promised.
+DEVIATIONS = 3.0
+# Self-calibration contradicts a calibration if it changes it by more than this many deviations and makes all walls
+# flatter by this factor: deviations alone leave systematic errors out.
+CHANGE_DEVIATIONS = 5.0
+CHANGE_GAIN = 1.1
+# Of all patches with a line so many must lie on walls that are judged.
+LEAST_SHARE = 0.05
+# The coefficient of a parabola over [-1, 1], of n even samples with unit noise, has this deviation times 1 / sqrt(n).
+PARABOLA = float(np.sqrt(45.0 / 4.0))
+
+
+class CheckParams(BaseModel, frozen=True, extra="forbid"):
+    """What a check asks of a scan."""
+
+    tolerance_px: float = Field(
+        3.0, gt=0, le=30, description="how bent a wall may be and still be one, where self-calibration cannot help [px]"
+    )
+    line_error_px: float = Field(
+        0.03, gt=0, le=2, description="error that all rows of a shot share, beside their noise [px]"
+    )
+    wall_mm_per_m: float = Field(0.5, ge=0, le=20, description="how flat walls themselves are [mm per m of length]")
+    smallest_share: float = Field(0.02, gt=0, lt=1, description="a wall has at least this share of all flat patches")
+    corner_deg: float = Field(0.5, gt=0, le=10, description="how far from square a room's corners may be [deg]")
+    square: bool = Field(True, description="whether the room's corners are square at all")
+
+
+@dataclass(frozen=True)
+class Wall:
+    """One flat piece, measured."""
+
+    plane: Array  # (4,) world frame
+    patches: int
+    bearings: int
+    length_m: float
+    range_m: float  # median
+    rms_m: float
+    rms_limit_m: float
+    bow_m: float  # height of the arc along its length, signed toward the scanner
+    bow_limit_m: float
+
+    @property
+    def strain(self) -> float:
+        """The worse of rms and bow in units of its limit; above 1 the wall is not as flat as promised."""
+        return max(self.rms_m / self.rms_limit_m, abs(self.bow_m) / self.bow_limit_m)
+
+
+class Corner(NamedTuple):
+    """Where two upright walls meet."""
+
+    first: int
+    second: int
+    angle_deg: float
+    sigma_deg: float
+
+
+class Passes(NamedTuple):
+    """Bearings that were measured more than once."""
+
+    bearings: int
+    rms_px: float  # of one measurement, from the differences
+    promised_px: float
+    lag_deg: float  # bearing by which the ways back and forth differ; NaN where not both were gone
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a scan says of its calibration."""
+
+    walls: tuple[Wall, ...]  # largest first
+    corners: tuple[Corner, ...]
+    passes: Passes | None
+    segments: Segments
+    patches: Patches
+    off_px: Array  # (B, R) columns beside the own wall's plane, NaN elsewhere
+    params: CheckParams
+    known: Uncertainty | None  # what the calibration says of itself
+    refined: Refined | None  # what self-calibration makes of the scan; None where it cannot
+
+    @property
+    def strain(self) -> float:
+        """Median over the walls' patches: one wall that really is bent does not condemn a calibration."""
+        order = np.argsort([wall.strain for wall in self.walls])
+        share = np.cumsum([self.walls[k].patches for k in order], dtype=float)
+        return float(self.walls[order[int(np.searchsorted(share, 0.5 * share[-1]))]].strain)
+
+    @property
+    def flat(self) -> bool:
+        """Whether the walls are as flat as promised."""
+        return self.strain <= 1.0
+
+    @property
+    def corners_hold(self) -> bool:
+        """Whether the corners are square, as far as that is asked and can be told."""
+        if not self.params.square or not self.corners:
+            return True
+        over = [abs(c.angle_deg - 90.0) - DEVIATIONS * c.sigma_deg for c in self.corners]
+        return float(np.median(over)) <= self.params.corner_deg
+
+    @property
+    def contradictions(self) -> list[Estimate]:
+        """What self-calibration changes beyond all that was promised."""
+        if self.refined is None or self.refined.rms_before_px < CHANGE_GAIN * self.refined.rms_after_px:
+            return []
+        promised = {"offset_x": "offset_x", "offset_y": "offset_y", "tilt_x": "tilt_x", "tilt_y": "tilt_y",
+                    "yaw": "plane_nx", "roll": "plane_nz", "distance": "plane_d"}  # fmt: skip
+        return [
+            e for e in self.refined.estimates
+            if e.observed and abs(e.change) > CHANGE_DEVIATIONS * np.hypot(
+                e.sigma, self.known.sigma(promised[e.name]) if self.known is not None else 0.0)
+        ]  # fmt: skip
+
+    @property
+    def passes_agree(self) -> bool:
+        """Whether repeated bearings give the same columns."""
+        return self.passes is None or self.passes.rms_px <= DEVIATIONS * self.passes.promised_px
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing contradicts the calibration."""
+        return self.flat and self.corners_hold and self.passes_agree and not self.contradictions
+
+
+def check(lines: Lines, calibration: Calibration, params: CheckParams | None = None) -> Check:
+    """Judge a calibration by one scan.
+
+    Raises:
+        CalibrationError: the scan shows too little that is flat to judge anything by.
+    """
+    params = params or CheckParams()
+    patches = patches_of(lines)
+    sight = sight_of(patches, calibration.intrinsics)
+    points, per_column = located(sight, calibration)
+    try:
+        refined: Refined | None = refine(lines, calibration, any_gain=True)
+    except CalibrationError:
+        refined = None
+    segments = refined.segments if refined else grow(points, per_column, patches, params.tolerance_px)
+    noise = max(params.line_error_px, refined.rms_after_px if refined else 0.0)
+    known = int(np.isfinite(points[..., 0]).sum())
+    sizes = np.bincount(segments.label[segments.label >= 0], minlength=len(segments))
+    chosen = [int(k) for k in np.argsort(-sizes) if sizes[k] >= params.smallest_share * sizes.sum()]
+    if not chosen or sizes[chosen].sum() < LEAST_SHARE * known:
+        raise CalibrationError(
+            f"too little in this recording is flat to judge by ({len(segments)} pieces, {known} patches with a line): "
+            "scan a room with bare walls; if this one has them, the calibration is far off: scanmap calibrate laser"
+        )
+    sigma = _patch_sigma(lines, patches)
+    spread = _Spread.of(calibration, sight)
+    off = np.full(points.shape[:2], np.nan)
+    walls, planes = [], []
+    for k in chosen:
+        member = segments.label == k
+        plane = fitted_plane(points[member], per_column[member], segments.planes[k, :3])
+        plane *= np.sign(plane[3]) or 1.0  # the normal toward the axis
+        off[member] = beside(points[member], per_column[member], plane)
+        walls.append(_wall(points[member], per_column[member], plane, sigma[member], member, spread, (noise, params)))
+        planes.append(plane)
+    return Check(
+        tuple(walls), _corners(walls), _passes(lines, params), segments, patches, off, params,
+        uncertainty_of(calibration), refined,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """How the calibration's covariance moves every patch: world displacements by one deviation of each direction."""
+
+    displacement: Array  # (D, B, R, 3) [m]
+
+    @classmethod
+    def of(cls, calibration: Calibration, sight: Sight) -> _Spread:
+        known = uncertainty_of(calibration)
+        if known is None:
+            return cls(np.zeros((0, *sight.ray.shape)))
+        here, _ = located(sight, calibration)
+        # The intrinsics change the rays themselves, which here are fixed: only plane and mount can be moved.
+        names = tuple(n for n in known.names if n.startswith(("plane", "offset", "tilt")))
+        if not names:
+            return cls(np.zeros((0, *sight.ray.shape)))
+        part = known.without(tuple(n for n in known.names if n not in names))
+        steps = deviations(part)
+        return cls(np.stack([located(sight, moved(calibration, part.names, step))[0] - here for step in steps]))
+
+    def along(self, member: Mask, normal: Array) -> Array:
+        """(D, N) displacement of the members along a normal [m]."""
+        along: Array = np.nan_to_num(self.displacement[:, member] @ normal)
+        return along
+
+
+def deviations(known: Uncertainty) -> Array:
+    """One-sigma steps (D, N) along the principal directions of a covariance, those that are not nil."""
+    values, vectors = np.linalg.eigh(known.matrix)
+    some = values > 1e-16 * max(float(values.max(initial=0.0)), 1e-300)
+    steps: Array = (vectors[:, some] * np.sqrt(values[some])).T
+    return steps
+
+
+def _wall(
+    points: Array,
+    per_column: Array,
+    plane: Array,
+    sigma: Array,
+    member: Mask,
+    spread: _Spread,
+    allowed: tuple[float, CheckParams],
+) -> Wall:
+    noise_px, params = allowed
+    normal = plane[:3]
+    height = points @ normal + plane[3]
+    per_px = np.maximum(np.abs(per_column @ normal), FLOOR_M_PER_PX)
+    along = _longest(points, normal)
+    length = float(np.ptp(np.percentile(along, [1.0, 99.0])))
+    own_m = 1e-3 * params.wall_mm_per_m * length
+    moved_by = spread.along(member, normal)
+    line = np.hypot(sigma, noise_px) * per_px
+    bearings = int(np.count_nonzero(member.any(axis=1)))
+    bow = _bow(along, height, per_px)
+    tilted = [_without_plane(points, part, normal) for part in moved_by]
+    rms_limit = np.sqrt(np.median(line**2) + sum(float(np.mean(part**2)) for part in tilted))
+    bow_limit = np.sqrt(
+        (PARABOLA * noise_px * float(np.median(per_px))) ** 2 / bearings
+        + sum(_bow(along, part, per_px) ** 2 for part in moved_by)
+    )
+    inside = np.abs(height) <= 4.0 * 1.4826 * np.median(np.abs(height))
+    return Wall(
+        plane=plane,
+        patches=len(points),
+        bearings=bearings,
+        length_m=length,
+        range_m=float(np.median(np.linalg.norm(points, axis=1))),
+        rms_m=float(np.sqrt(np.mean(height[inside] ** 2))),
+        rms_limit_m=float(np.hypot(DEVIATIONS * rms_limit, own_m)),
+        bow_m=bow,
+        bow_limit_m=float(np.hypot(DEVIATIONS * bow_limit, own_m)),
+    )
+
+
+def _longest(points: Array, normal: Array) -> Array:
+    """Coordinate (N,) of points along the direction in their plane in which they reach farthest [m]."""
+    q = points - points.mean(axis=0)
+    q = q - (q @ normal)[:, None] * normal
+    direction = np.linalg.eigh(q.T @ q)[1][:, 2]
+    along: Array = q @ direction
+    return along
+
+
+def _bow(along: Array, height: Array, per_px: Array) -> float:
+    """Height [m] of the arc that a parabola through (along, height) makes over the wall's length, Cauchy-weighted."""
+    half = 0.5 * float(np.ptp(np.percentile(along, [1.0, 99.0]))) or 1.0
+    s = (along - np.median(along)) / half
+    A = np.stack([np.ones_like(s), s, s * s], axis=1)
+    weight = 1.0 / per_px
+    for _ in range(4):
+        coefficients = np.linalg.lstsq(A * weight[:, None], height * weight, rcond=None)[0]
+        left = (height - A @ coefficients) / per_px
+        scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-6)
+        weight = 1.0 / per_px / np.sqrt(1.0 + (left / (2.0 * scatter)) ** 2)
+    return float(coefficients[2])
+
+
+def _without_plane(points: Array, height: Array, normal: Array) -> Array:
+    """Heights (N,) less the plane through them: what of a displacement is no shift and no turn."""
+    A = np.column_stack([np.ones(len(points)), points - (points @ normal)[:, None] * normal])
+    left: Array = height - A @ np.linalg.lstsq(A, height, rcond=None)[0]
+    return left
+
+
+def _patch_sigma(lines: Lines, patches: Patches) -> Array:
+    """(B, R) median sigma of the rows of each patch [px]."""
+    shots, count = patches.column_px.shape
+    rows = lines.sigma_px.shape[1] // count
+    sigma = lines.sigma_px[patches.order, : count * rows].reshape(shots, count, rows)
+    known = np.isfinite(sigma)
+    total: Array = np.where(known, sigma, 0.0).sum(axis=2) / np.maximum(known.sum(axis=2), 1)
+    return total
+
+
+def _corners(walls: list[Wall]) -> tuple[Corner, ...]:
+    """Pairs of upright walls nearly square to each other, the largest first."""
+    upright = [k for k, wall in enumerate(walls) if abs(wall.plane[2]) < 0.15]
+    corners = []
+    for a in upright:
+        for b in upright:
+            if b <= a:
+                continue
+            angle = float(np.degrees(np.arccos(np.clip(walls[a].plane[:3] @ walls[b].plane[:3], -1.0, 1.0))))
+            if abs(angle - 90.0) < 15.0:
+                slack = [
+                    np.degrees(wall.rms_limit_m / DEVIATIONS / max(wall.length_m, 1e-3))
+                    for wall in (walls[a], walls[b])
+                ]
+                corners.append(Corner(a, b, angle, float(np.hypot(*slack))))
+    return tuple(corners[:12])
+
+
+def _passes(lines: Lines, params: CheckParams) -> Passes | None:
+    """How well repeated bearings agree; None where nothing was repeated."""
+    turned = np.mod(lines.bearings - lines.bearings.min() + 1e-9, 2.0 * np.pi)
+    order = np.argsort(turned, kind="stable")
+    close = np.flatnonzero(np.diff(turned[order]) < np.radians(0.02))
+    if len(close) < 3:
+        return None
+    first, second = order[close], order[close + 1]
+    first, second = np.minimum(first, second), np.maximum(first, second)
+    difference = lines.column_px[second] - lines.column_px[first]
+    promised = np.sqrt(lines.sigma_px[first] ** 2 + lines.sigma_px[second] ** 2 + 2.0 * params.line_error_px**2)
+    known = np.isfinite(difference)
+    if known.sum() < 50:
+        return None
+    scatter = 1.4826 * float(np.median(np.abs(difference[known]))) / np.sqrt(2.0)
+    return Passes(len(close), scatter, float(np.median(promised[known])) / np.sqrt(2.0), _lag(lines, first, second))
+
+
+def _lag(lines: Lines, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:
+    """Bearing [deg] by which the second pass trails the first where they were gone in opposite directions.
+
+    The columns' change with the bearing is measured in the scan itself: du = (du/db) lag.
+    """
+    before, after = np.clip(first - 1, 0, None), np.clip(first + 1, None, len(lines.bearings) - 1)
+    span = lines.bearings[after] - lines.bearings[before]
+    last = len(lines.bearings) - 1
+    back = lines.bearings[np.clip(second + 1, None, last)] - lines.bearings[np.clip(second - 1, 0, None)]
+    opposite = np.sign(span) * np.sign(back) < 0
+    if opposite.sum() < 3:
+        return float("nan")
+    slope = (lines.column_px[after] - lines.column_px[before]) / span[:, None]
+    difference = lines.column_px[second] - lines.column_px[first]
+    smooth = np.isfinite(slope) & np.isfinite(difference) & (np.abs(slope) < 20.0 / np.radians(1.0))
+    smooth &= opposite[:, None]
+    if smooth.sum() < 50:
+        return float("nan")
+    x, y = slope[smooth], difference[smooth]
+    lag = 0.0
+    for _ in range(10):
+        left = y - lag * x
+        weight = 1.0 / (1.0 + (left / (2.0 * max(1.4826 * float(np.median(np.abs(left))), 1e-3))) ** 2)
+        lag = float((weight * x * y).sum() / max((weight * x * x).sum(), 1e-12))
+    return float(np.degrees(lag))
