@@ -28,6 +28,8 @@ GATES = {
     "camera_rms_px": Gate(1.0, "corners of the board against the camera model", "scanmap calibrate camera", True),
     "laser_rms_px": Gate(1.0, "laser line on the board against the laser plane", "scanmap calibrate laser", True),
     "axis_rms_px": Gate(1.5, "corners of the board against the turn about the axis", "scanmap calibrate axis", True),
+    "self_rms_px": Gate(1.0, "laser line on flat walls against their planes", "scanmap calibrate self", True),
+    "table_worst_percent": Gate(10.0, "measured distances against the pinhole head", "scanmap calibrate table"),
 }
 
 

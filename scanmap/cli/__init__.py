@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, hardware, latency, live, look, scanning, settings, tabling, terminal
+from scanmap.cli import calibrating, hardware, judging, latency, live, look, scanning, settings, tabling, terminal
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -35,6 +35,8 @@ app.command()(hardware.doctor)
 app.command()(hardware.init)
 app.add_typer(hardware.stage)
 calibrating.calibrate.command()(tabling.table)
+calibrating.calibrate.command("self")(judging.self_)
+calibrating.calibrate.command()(judging.check)
 calibrating.calibrate.command()(latency.latency)
 app.add_typer(calibrating.calibrate)
 

@@ -31,12 +31,21 @@ class Pipeline:
     """What turns one shot into points; the same object serves every worker, for it changes nothing."""
 
     def __init__(
-        self, calibration: Calibration, laserline: LaserLineParams, triangulation: TriangulationParams
+        self,
+        calibration: Calibration,
+        laserline: LaserLineParams,
+        triangulation: TriangulationParams,
+        slack_px: float = 0.0,
     ) -> None:
+        """Make ready; with `slack_px` more columns to either side than range_min and range_max allow.
+
+        A calibration that is to be judged or refined must not hide from view what speaks against it.
+        """
         self.calibration = calibration
         self.laserline = laserline
         self.triangulation = triangulation
         self.window: NDArray[np.float64] = column_window(calibration, triangulation)
+        self.window += np.array([-slack_px, slack_px])
         self.colour = needs_colour(laserline)  # whether the line is found in colour or a grey decode will do
 
     def process(self, shot: Shot) -> Step:

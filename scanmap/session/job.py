@@ -111,7 +111,7 @@ class Job:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
             sinks = self._sinks(scan, faults, progress)
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
-            with closing(self._recorded()) as shots, self._workers(pipeline) as (process, threads):
+            with closing(self._recorded()) as shots, self.workers(pipeline) as (process, threads):
                 run(checked(shots, self.calibration), process, sinks, stop, threads)
             if stop():
                 ended = "interrupted"
@@ -131,7 +131,7 @@ class Job:
         return self._finished(scan, faults, ended, error)
 
     @contextmanager
-    def _workers(self, pipeline: Pipeline) -> Iterator[tuple[Callable[[Shot], Step], int]]:
+    def workers(self, pipeline: Pipeline) -> Iterator[tuple[Callable[[Shot], Step], int]]:
         """What processes a shot, and in how many threads; a live scan waits for its camera, not for a core."""
         if not self.recorded or not worth_processes(self.total):
             yield pipeline.process, 0

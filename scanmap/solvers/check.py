@@ -18,6 +18,7 @@ from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import Uncertainty, moved, uncertainty_of
 from scanmap.errors import CalibrationError
 from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, beside, fitted_plane, grow
+from scanmap.solvers.passes import Passes, compare_passes
 from scanmap.solvers.self_calibration import Estimate, Refined, refine
 from scanmap.solvers.sight import Lines, Patches, Sight, located, patches_of, sight_of
 
@@ -78,15 +79,6 @@ class Corner(NamedTuple):
     second: int
     angle_deg: float
     sigma_deg: float
-
-
-class Passes(NamedTuple):
-    """Bearings that were measured more than once."""
-
-    bearings: int
-    rms_px: float  # of one measurement, from the differences
-    promised_px: float
-    lag_deg: float  # bearing by which the ways back and forth differ; NaN where not both were gone
 
 
 @dataclass(frozen=True)
@@ -171,21 +163,42 @@ def check(lines: Lines, calibration: Calibration, params: CheckParams | None = N
             f"too little in this recording is flat to judge by ({len(segments)} pieces, {known} patches with a line): "
             "scan a room with bare walls; if this one has them, the calibration is far off: scanmap calibrate laser"
         )
-    sigma = _patch_sigma(lines, patches)
-    spread = _Spread.of(calibration, sight)
+    walls, off = walls_under(calibration, lines, patches, segments, chosen, (noise, params))
+    return Check(
+        walls, _corners(walls), compare_passes(lines, params.line_error_px), segments, patches, off, params,
+        uncertainty_of(calibration), refined,
+    )  # fmt: skip
+
+
+def walls_under(
+    calibration: Calibration,
+    lines: Lines,
+    patches: Patches,
+    segments: Segments,
+    chosen: list[int],
+    allowed: tuple[float, CheckParams],
+) -> tuple[tuple[Wall, ...], Array]:
+    """Flat pieces as they come out under a calibration, whichever they were found with.
+
+    Args:
+        chosen: numbers of the pieces.
+        allowed: error that a shot's rows share [px], and the check's parameters.
+
+    Returns:
+        A `Wall` each, and columns (B, R) that patches lie beside their own wall's plane, NaN off the walls.
+    """
+    sight = sight_of(patches, calibration.intrinsics)
+    points, per_column = located(sight, calibration)
+    sigma, spread = _patch_sigma(lines, patches), _Spread.of(calibration, sight)
     off = np.full(points.shape[:2], np.nan)
-    walls, planes = [], []
+    walls = []
     for k in chosen:
-        member = segments.label == k
+        member = (segments.label == k) & np.isfinite(points[..., 0])
         plane = fitted_plane(points[member], per_column[member], segments.planes[k, :3])
         plane *= np.sign(plane[3]) or 1.0  # the normal toward the axis
         off[member] = beside(points[member], per_column[member], plane)
-        walls.append(_wall(points[member], per_column[member], plane, sigma[member], member, spread, (noise, params)))
-        planes.append(plane)
-    return Check(
-        tuple(walls), _corners(walls), _passes(lines, params), segments, patches, off, params,
-        uncertainty_of(calibration), refined,
-    )  # fmt: skip
+        walls.append(_wall(points[member], per_column[member], plane, sigma[member], member, spread, allowed))
+    return tuple(walls), off
 
 
 @dataclass(frozen=True)
@@ -302,7 +315,7 @@ def _patch_sigma(lines: Lines, patches: Patches) -> Array:
     return total
 
 
-def _corners(walls: list[Wall]) -> tuple[Corner, ...]:
+def _corners(walls: tuple[Wall, ...]) -> tuple[Corner, ...]:
     """Pairs of upright walls nearly square to each other, the largest first."""
     upright = [k for k, wall in enumerate(walls) if abs(wall.plane[2]) < 0.15]
     corners = []
@@ -318,48 +331,3 @@ def _corners(walls: list[Wall]) -> tuple[Corner, ...]:
                 ]
                 corners.append(Corner(a, b, angle, float(np.hypot(*slack))))
     return tuple(corners[:12])
-
-
-def _passes(lines: Lines, params: CheckParams) -> Passes | None:
-    """How well repeated bearings agree; None where nothing was repeated."""
-    turned = np.mod(lines.bearings - lines.bearings.min() + 1e-9, 2.0 * np.pi)
-    order = np.argsort(turned, kind="stable")
-    close = np.flatnonzero(np.diff(turned[order]) < np.radians(0.02))
-    if len(close) < 3:
-        return None
-    first, second = order[close], order[close + 1]
-    first, second = np.minimum(first, second), np.maximum(first, second)
-    difference = lines.column_px[second] - lines.column_px[first]
-    promised = np.sqrt(lines.sigma_px[first] ** 2 + lines.sigma_px[second] ** 2 + 2.0 * params.line_error_px**2)
-    known = np.isfinite(difference)
-    if known.sum() < 50:
-        return None
-    scatter = 1.4826 * float(np.median(np.abs(difference[known]))) / np.sqrt(2.0)
-    return Passes(len(close), scatter, float(np.median(promised[known])) / np.sqrt(2.0), _lag(lines, first, second))
-
-
-def _lag(lines: Lines, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:
-    """Bearing [deg] by which the second pass trails the first where they were gone in opposite directions.
-
-    The columns' change with the bearing is measured in the scan itself: du = (du/db) lag.
-    """
-    before, after = np.clip(first - 1, 0, None), np.clip(first + 1, None, len(lines.bearings) - 1)
-    span = lines.bearings[after] - lines.bearings[before]
-    last = len(lines.bearings) - 1
-    back = lines.bearings[np.clip(second + 1, None, last)] - lines.bearings[np.clip(second - 1, 0, None)]
-    opposite = np.sign(span) * np.sign(back) < 0
-    if opposite.sum() < 3:
-        return float("nan")
-    slope = (lines.column_px[after] - lines.column_px[before]) / span[:, None]
-    difference = lines.column_px[second] - lines.column_px[first]
-    smooth = np.isfinite(slope) & np.isfinite(difference) & (np.abs(slope) < 20.0 / np.radians(1.0))
-    smooth &= opposite[:, None]
-    if smooth.sum() < 50:
-        return float("nan")
-    x, y = slope[smooth], difference[smooth]
-    lag = 0.0
-    for _ in range(10):
-        left = y - lag * x
-        weight = 1.0 / (1.0 + (left / (2.0 * max(1.4826 * float(np.median(np.abs(left))), 1e-3))) ** 2)
-        lag = float((weight * x * y).sum() / max((weight * x * x).sum(), 1e-12))
-    return float(np.degrees(lag))
