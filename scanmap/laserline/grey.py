@@ -95,7 +95,7 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> U8:
     _, rough = cv2.threshold(rough, _ROUGH, 255, cv2.THRESH_BINARY)
     lit = cv2.addWeighted(plane, 1.0, cv2.copyTo(background, rough, smooth), -gain, float(PEDESTAL))
     _, blind = cv2.threshold(background, SATURATED - 1, 255, cv2.THRESH_BINARY)
-    lit = np.asarray(cv2.subtract(lit, blind), np.uint8)
+    lit[blind > 0] = PEDESTAL
     if threshold > 0:
         lit[lit < PEDESTAL + threshold] = PEDESTAL
     return np.asarray(lit, np.uint8)

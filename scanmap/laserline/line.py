@@ -40,7 +40,8 @@ _CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 # Short runs of rows known no better than this are given up, and those that stand out of what is left of the room's own
 # edges by no more than the second; single rows by no more than the first.
-_WEAK_PX, _STANDS_OUT = 0.2, (2.5, 5.0)
+_WEAK_PX, _STANDS_OUT = 0.2, (2.5, 4.5)
+_BLOCKS_ROWS = 18
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
@@ -180,9 +181,12 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         gain = exposure_gain(sight.on, sight.off)
-        height = standing_out(line.column_px, line.peak, sight.on, sight.off, gain)
+        height, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, gain)
         line = _lost(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
-        weak |= height < _STANDS_OUT[1]
+        # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
+        disturbed = with_ripple < _STANDS_OUT[1]
+        line = _lost(line, runs.crumbs(line.column_px, disturbed, _BLOCKS_ROWS), Reason.AMBIGUOUS)
+        weak |= disturbed
     line = _lost(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
     return _pooled(line, params.pool_rows)
 

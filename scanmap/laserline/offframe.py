@@ -14,10 +14,11 @@ _CONTRAST = 16  # [grey levels] from which on a place has any
 _BRIGHTEST = 240  # [grey levels] brighter ones are cut
 _ROW_STEP = 8
 _FEW = 50
+_RIPPLE_REACH, _RIPPLE = 6, 0.5  # [px] around a place, and the part of what is missing there that counts
 _SHARE = 0.04  # of a contrast that a shaken camera leaves besides
 
 
-def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> F64:
+def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> tuple[F64, F64]:
     """Height of each row's line over what a shaken or recompressed edge leaves there in the difference.
 
     Args:
@@ -26,11 +27,12 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
         gain: that the background is multiplied by.
 
     Returns:
-        (H,) heights in standard deviations of what is left; infinite where the room is even, or has no line.
+        Heights (H,) in standard deviations of what is left, infinite where the room is even or has no line; and the
+        same with what the row itself shows of it, too much for one row to be judged by.
 
     What remains where the room has contrast is measured in the two pictures themselves.
     """
-    ratio = np.full(len(column), np.inf)
+    ratio, beside = (np.full(len(column), np.inf) for _ in range(2))
     row = np.flatnonzero(np.isfinite(column))
     left = _remaining(image, background, gain) if row.size else 0.0
     if left > 0.0:
@@ -38,8 +40,14 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
         x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, background.shape[1] - 1)
         contrast = gain * np.ptp(background[row[:, None], x].astype(np.float32), axis=1)
         uneven = contrast > _CONTRAST
-        ratio[row[uneven]] = peak[row[uneven]] / np.hypot(left, _SHARE * contrast[uneven])
-    return ratio
+        row, middle = row[uneven], middle[uneven]
+        x = np.clip(middle[:, None] + np.arange(-_RIPPLE_REACH, _RIPPLE_REACH + 1), 0, background.shape[1] - 1)
+        added = image[row[:, None], x] - gain * background[row[:, None], x].astype(np.float32)
+        # A laser adds light and never takes any: what is missing beside a place tells how much too much is there.
+        ripple = np.median(added, axis=1) - added.min(axis=1)
+        rest = np.hypot(left, _SHARE * contrast[uneven])
+        ratio[row], beside[row] = peak[row] / rest, peak[row] / np.hypot(rest, _RIPPLE * ripple)
+    return ratio, beside
 
 
 def _remaining(image: U8, background: U8, gain: float) -> float:

@@ -76,8 +76,11 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
     return mask
 
 
-def crumbs(column: Array, weak: Mask) -> Mask:
-    """Short runs of rows (H,) that no neighbour on either side continues: 3 rows always, 11 if most are `weak` (H,)."""
+def crumbs(column: Array, weak: Mask, least: int = 12) -> Mask:
+    """Short runs of rows (H,) that no neighbour on either side continues.
+
+    Of 3 rows always, and of fewer than `least` if most are `weak` (H,).
+    """
     mask = np.zeros(len(column), bool)
     found = np.flatnonzero(np.isfinite(column))
     if not found.size:
@@ -86,5 +89,5 @@ def crumbs(column: Array, weak: Mask) -> Mask:
     number = np.concatenate([[0], np.cumsum(~linked)])
     rows = np.bincount(number)
     doubtful = np.bincount(number, weak[found]) > 0.5 * rows
-    mask[found[((rows < 4) | (doubtful & (rows < 12)))[number]]] = True
+    mask[found[((rows < 4) | (doubtful & (rows < least)))[number]]] = True
     return mask
