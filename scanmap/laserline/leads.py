@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from scanmap.laserline.candidates import runs_in
 from scanmap.laserline.colour import heights_of
 from scanmap.laserline.path import JUMP
 
@@ -60,10 +60,7 @@ def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
 def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> F32:
     """The highest response (B,) of each block apart from the place `at` (B,) [grey levels]."""
     length = min(2 * max(int(_APART_PX) // scale, _CENTRE + 1) + 1, response.shape[1])
-    size = response.strides[1]
-    shape = (len(response), response.shape[1] - length + 1, length)
-    runs = as_strided(response, shape, (response.strides[0], size, size))
-    # Whole runs of memory are cleared at once, ten times the speed of picking samples one by one.
+    runs = runs_in(response, length)
     runs[np.arange(len(at)), np.clip(at - length // 2, 0, runs.shape[1] - 1)] = 0
     highest: F32 = response.max(axis=1) * np.float32(1.0 / (_CENTRE * scale))
     return highest

@@ -20,7 +20,7 @@ from scanmap.laserline.grey import Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
-from scanmap.laserline.pooling import pool, unexplained
+from scanmap.laserline.pooling import pool, segments, unexplained
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
 from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
@@ -193,15 +193,17 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
 
 def _pooled(line: LaserLine, rows: int) -> LaserLine:
     """The line with sigmas that the scatter along it bears out, and pooled over so many rows (3 or more)."""
-    more = unexplained(line.column_px, line.sigma_px, _APART_ROWS)
+    parts = segments(line.column_px, line.sigma_px)
+    more = unexplained(line.column_px, line.sigma_px, parts[0], _APART_ROWS)
     correlated = more > _MORE
     if correlated:
         line.sigma_px[:] *= more
+        parts = segments(line.column_px, line.sigma_px)
     if rows < 3:
         return line
-    pooled, sigma = pool(line.column_px, line.sigma_px, rows)
+    pooled, sigma = pool(line.column_px, line.sigma_px, rows, parts)
     # Errors that are alike in neighbouring rows do not average out as others do.
-    more = unexplained(pooled, sigma, (rows + 1,))
+    more = unexplained(pooled, sigma, parts[0], (rows + 1,))
     if correlated or more > _MORE:
         sigma *= max(more, _LESS)
     return line._replace(column_px=pooled, sigma_px=sigma)

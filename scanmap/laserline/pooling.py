@@ -16,23 +16,24 @@ _MISFIT = 4.5
 # Chi^2 of a bend that is kept by half; share of a bend's variance that remains when nothing of it is kept.
 _BEND_DOUBT, _BEND_LEAST = 2.0, 0.5
 
-_TELLING = 150  # rows that tell whether sigma is too small
+_TELLING = 75  # rows that tell whether sigma is too small
 
 
-def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
+def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] | None = None) -> tuple[Array, Array]:
     """Columns and sigmas (H,) after a weighted quadratic over at most `support` rows of one segment.
 
     Args:
         column: (H,) NaN where a row has no line.
         sigma: (H,) standard deviations.
         support: odd number of rows.
+        parts: what `segments` gives, where it is known.
 
     Segments end at missing rows and where the column steps; the window of a row slides inward at a segment's
     ends and never reaches over them. Where the quadratic does not describe the rows (texture, a bend) the
     support shrinks to 5 and then 1. Source: Savitzky and Golay 1964, with weights.
     """
     out_column, out_sigma = column.copy(), sigma.copy()
-    start, stop = _segments(column, sigma)
+    start, stop = segments(column, sigma) if parts is None else parts
     pending = np.isfinite(column)
     for rows in (support, 5):
         if rows > support or rows > len(column):
@@ -49,26 +50,26 @@ def pool(column: Array, sigma: Array, support: int) -> tuple[Array, Array]:
     return out_column, out_sigma
 
 
-def unexplained(column: Array, sigma: Array, lags: tuple[int, ...]) -> float:
+def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]) -> float:
     """How much more (or less) the columns of a line scatter than their sigmas say, as a factor; 1 where too few tell.
 
     Args:
         column: (H,) NaN where a row has no line.
         sigma: (H,) standard deviations.
+        start: (H,) first row of the segment each row belongs to.
         lags: rows so far apart that their errors have little to do with each other.
 
     What JPEG's blocks and a camera's sharpening do to a line looks like a line moved: a row's own samples cannot tell.
     Other rows can: fourth differences of a line are zero on every surface bent no more than a cubic, and 70 variances
     of noise. The median of all rows counts, so that edges do not.
     """
-    start, _ = _segments(column, sigma)
     variance = np.square(sigma)
     squares = []
     for lag in lags:
         span = 4 * lag
         if len(column) <= span:
             return 1.0
-        at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))
+        at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))[::2]
         if len(at) < _TELLING:
             return 1.0
         a, b, c, d, e = (column[at + k * lag] for k in range(5))
@@ -79,7 +80,7 @@ def unexplained(column: Array, sigma: Array, lags: tuple[int, ...]) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def _segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First row and end of the segment that each row belongs to."""
     rows = len(column)
     step = np.diff(column)
