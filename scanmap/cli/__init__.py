@@ -12,7 +12,19 @@ from typing import Annotated
 import typer
 
 from scanmap import __version__
-from scanmap.cli import calibrating, hardware, judging, latency, live, look, scanning, settings, tabling, terminal
+from scanmap.cli import (
+    calibrating,
+    designing,
+    hardware,
+    judging,
+    latency,
+    live,
+    look,
+    scanning,
+    settings,
+    tabling,
+    terminal,
+)
 from scanmap.errors import ConfigError, ScanmapError
 
 app = typer.Typer(
@@ -39,6 +51,7 @@ calibrating.calibrate.command("self")(judging.self_)
 calibrating.calibrate.command()(judging.check)
 calibrating.calibrate.command()(latency.latency)
 app.add_typer(calibrating.calibrate)
+app.command()(designing.design)
 
 
 def _version(asked: bool) -> None:

@@ -61,7 +61,7 @@ def self_(
         say(f"wrote {figure}")
     kept = write_refined(refined, out, recording, is_twin=is_twin)
     say(f"wrote {out}" + (f"; the one that was there is {kept}" if kept else ""))
-    files = f"{shlex.quote(str(recording))} --calibration {shlex.quote(str(out))}"
+    files = f"{shlex.quote(str(recording))}{_again(config, set_)} --calibration {shlex.quote(str(out))}"
     say(f"next: scanmap calibrate check {files}")
     say(f"next: scanmap replay {files} --out room.ply")
 
@@ -101,8 +101,18 @@ def check(
         draw_check(judged, measured.calibration, figure, f"{recording.name}: {'pass' if judged.passed else 'FAIL'}")
         say(f"wrote {figure}")
     if not judged.passed:
-        say(f"next: scanmap calibrate self {shlex.quote(str(recording))}, or with a board: scanmap calibrate laser")
+        say(
+            f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}"
+            + (f" --calibration {shlex.quote(calibration)}" if calibration is not None else "")
+            + ", or with a board: scanmap calibrate laser"
+        )
         raise typer.Exit(1)
+
+
+def _again(config: str | None, set_: list[str] | None) -> str:
+    """The options that a following command needs too."""
+    options = [] if config is None else [f" --config {shlex.quote(config)}"]
+    return "".join([*options, *(f" --set {shlex.quote(one)}" for one in set_ or ())])
 
 
 def _check_figure(figure: Path | None) -> None:
