@@ -74,6 +74,7 @@ def test_doctor_of_a_rig_that_is_not_there_is_a_fault(run: Run, nothing_attached
 
 @pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
 def test_doctor_of_a_whole_rig(run: Run, head: Head, attached: str) -> None:
+    head.device.period_s = 0.07
     settings = [word for key in HARDWARE if "latency" not in key for word in ("--set", key)]
     said = run("doctor", *settings, "--set", f"stage.port={attached}")
     assert "ok    camera: 0 (Fake Cam): 320x240 at" in said.out
@@ -149,26 +150,50 @@ def test_the_laser_is_on_only_while_the_command_runs(head: Head, attached: str) 
     assert not head.board.laser_on
 
 
-LASER = """
+LIT = """
 import sys
+import cv2
+from fake_cameras import FakeCapture, FakeDevice
 from scanmap.cli import main
 from scanmap.rig import grbl
+device = FakeDevice(sizes=((320, 240),))
+cv2.VideoCapture = lambda *_: FakeCapture(device)
 grbl.BOOT_S = 0.1
-main(["stage", "laser", "on", "--seconds", "60", "--set", "rig=hardware", "--set", f"stage.port={sys.argv[1]}"])
+settings = ["rig=hardware", "camera.source=0", "calibration.image.width=320", "calibration.image.height=240"]
+words = [word for setting in (*settings, f"stage.port={sys.argv[1]}") for word in ("--set", setting)]
+main([*sys.argv[2].split(), *words])
 """
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_switches_the_laser_off(end: signal.Signals) -> None:
-    board = Firmware()
+@pytest.mark.parametrize(
+    ("command", "end"),
+    [
+        ("stage laser on --seconds 60", signal.SIGINT),
+        ("stage laser on --seconds 60", signal.SIGTERM),
+        ("live --no-view", signal.SIGINT),
+        ("live --no-view", signal.SIGTERM),
+        pytest.param("doctor", signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("calibrate latency --method blink", signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("calibrate latency", signal.SIGINT, marks=pytest.mark.slow),
+    ],
+)
+def test_a_signal_switches_the_laser_off_and_frees_the_motor(command: str, end: signal.Signals) -> None:
+    board = Firmware(instant="calibrate latency" not in command)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with pty_port(board) as url:
-        process = subprocess.Popen([sys.executable, "-c", LASER, url], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            [sys.executable, "-c", LIT, url, command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment,
+        )
         try:
             deadline = time.monotonic() + 60
-            while not board.laser_on and time.monotonic() < deadline:
-                time.sleep(0.05)
-            assert board.laser_on
+            while not board.laser_on and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.02)
+            assert board.laser_on, process.communicate(timeout=30)
             process.send_signal(end)
             _, errors = process.communicate(timeout=30)
         finally:

@@ -41,7 +41,7 @@ def two_passes(speed: float, latency: float, backlash: float, rng: np.random.Gen
     return speed, passes[0], passes[1]
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(latency=st.floats(-0.05, 0.4), seed=st.integers(0, 1000))
 def test_latency_from_two_directions(latency: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -30,13 +30,16 @@ def doctor(config: ConfigOption = None, set_: SetOption = None, calibration: Cal
 
     Example: scanmap doctor --config my-rig.toml
     """
+    from contextlib import closing
+
     from scanmap import session
     from scanmap.cli.terminal import say, stop_on_signal
 
     marks = {"ok": "ok   ", "note": "note ", "fault": "FAULT"}
     faults = 0
-    with stop_on_signal():
-        for finding in session.examine(session.Choice(config, tuple(set_ or ()), calibration), Path.cwd()):
+    choice = session.Choice(config, tuple(set_ or ()), calibration)
+    with stop_on_signal(), closing(session.examine(choice, Path.cwd())) as findings:
+        for finding in findings:
             say(f"{marks[finding.state]} {finding.part}: {finding.words}")
             faults += finding.state == "fault"
     say(f"{faults} {'fault' if faults == 1 else 'faults'}" if faults else "ready to scan")

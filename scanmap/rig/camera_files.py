@@ -18,6 +18,10 @@ from scanmap.shot import encode_png, image_format
 SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
+class NoMorePicturesError(CameraError):
+    """A file or folder came to its end."""
+
+
 class FileCamera:
     """Hands out pictures in order, stamped with the time they are asked for. Implements `scanmap.rig.Camera`."""
 
@@ -69,7 +73,7 @@ class FileCamera:
         try:
             return next(self._pictures)
         except StopIteration:
-            raise CameraError(
+            raise NoMorePicturesError(
                 f"camera {self.name} has no more pictures: it is a file or folder, and at its end"
             ) from None
         except OSError as error:

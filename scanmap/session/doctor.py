@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -12,7 +12,7 @@ from scanmap.calibration import Calibration
 from scanmap.config import Config
 from scanmap.errors import CalibrationError, CameraError, ConfigError, ScanmapError, StageError
 from scanmap.pipeline import Pipeline
-from scanmap.rig import Streaming
+from scanmap.rig import Frame, Streaming
 from scanmap.rig.camera import camera_devices
 from scanmap.rig.camera_probe import probe_modes
 from scanmap.rig.grbl import identify
@@ -38,7 +38,7 @@ class Finding(NamedTuple):
     words: str
 
 
-def examine(choice: Choice, folder: Path) -> Iterator[Finding]:
+def examine(choice: Choice, folder: Path) -> Generator[Finding]:
     """Everything a scan with this configuration needs; each finding as soon as it is known.
 
     Args:
@@ -108,25 +108,28 @@ def _rig(config: Config, head: Calibration, folder: Path) -> Iterator[Finding]:
         yield Finding("rig", "fault", str(error))
         return
     try:
-        yield Finding("rig", "ok", rig_words(config, opened.rig))
-        checks = (_picture(opened, head), _laser(opened, config), _speed(opened, config, head))
-        for check in (*checks, _disk(opened, config, folder)):
-            try:
-                yield from check
-            except ScanmapError as error:
-                yield Finding("rig", "fault", str(error))
+        yield Finding("rig", "ok", rig_words(config, opened.rig).removeprefix("rig: "))
+        opened.rig.stage.laser(True)
+        frame = opened.rig.camera.grab()
+        opened.rig.stage.laser(False)
+        yield _picture(opened, config, head)
+        yield from _speed(opened, config, head, frame)
+        yield _disk(config, folder, len(frame.image))
+        if config.camera.kind in ("device", "http", "stream") or opened.rig.is_twin:
+            yield from _laser(opened, config)
+    except ScanmapError as error:
+        yield Finding("rig", "fault", str(error))
     finally:
         opened.close()
 
 
-def _picture(opened: OpenRig, head: Calibration) -> Iterator[Finding]:
+def _picture(opened: OpenRig, config: Config, head: Calibration) -> Finding:
     camera = opened.rig.camera
-    camera.grab()
-    words = f"pictures of {camera.width}x{camera.height}"
-    if isinstance(camera, Streaming):
-        words += f", {_rate(camera):.1f} a second"
     head.check_image(camera.width, camera.height)
-    yield Finding("picture", "ok", words)
+    size = f"pictures of {camera.width}x{camera.height}"
+    if not isinstance(camera, Streaming) or (config.camera.kind in ("file", "folder") and not opened.rig.is_twin):
+        return Finding("picture", "ok", size)
+    return Finding("picture", "ok", f"{size}, {_rate(camera):.1f} a second")
 
 
 def _rate(camera: Streaming) -> float:
@@ -158,12 +161,9 @@ def _laser(opened: OpenRig, config: Config) -> Iterator[Finding]:
         yield Finding("latency", state, f"{1e3 * latency_s:.0f} +- {1e3 * found.sigma_s:.0f} ms{advice}")
 
 
-def _speed(opened: OpenRig, config: Config, head: Calibration) -> Iterator[Finding]:
+def _speed(opened: OpenRig, config: Config, head: Calibration, frame: Frame) -> Iterator[Finding]:
     """Pictures a second that one core decodes and finds the line in, against the camera's."""
     camera = opened.rig.camera
-    opened.rig.stage.laser(True)
-    frame = camera.grab()
-    opened.rig.stage.laser(False)
     process = Pipeline(head, config.laserline, config.triangulation).process
     shot = Shot(0, 0.0, 0.0, 0.0, frame.image)
     process(shot)
@@ -179,11 +179,10 @@ def _speed(opened: OpenRig, config: Config, head: Calibration) -> Iterator[Findi
     yield Finding("speed", state, f"one core finds the line in {rate:.0f} pictures a second{advice}")
 
 
-def _disk(opened: OpenRig, config: Config, folder: Path) -> Iterator[Finding]:
+def _disk(config: Config, folder: Path, picture_bytes: int) -> Finding:
     free = shutil.disk_usage(folder).free
-    swept = plan(config.sweep)
-    frames = len(swept.bearings) * (2 if config.sweep.off_frames else 1)
-    need = frames * len(opened.rig.camera.grab().image) + config.recording.min_free_mb * MB
+    frames = len(plan(config.sweep).bearings) * (2 if config.sweep.off_frames else 1)
+    need = frames * picture_bytes + config.recording.min_free_mb * MB
     words = f"{free / MB:.0f} MB free, a scan of {frames} pictures needs {need / MB:.0f}"
     fits = free > need
-    yield Finding("disk", "ok" if fits else "fault", words + ("" if fits else ": free some, or record elsewhere"))
+    return Finding("disk", "ok" if fits else "fault", words + ("" if fits else ": free some, or record elsewhere"))

@@ -22,6 +22,7 @@ from scanmap.pipeline import Pipeline, Step
 from scanmap.recording import open_source
 from scanmap.rig import Camera, Frame, Streaming
 from scanmap.rig.camera import open_camera
+from scanmap.rig.camera_files import NoMorePicturesError
 from scanmap.session.preparing import Choice, prepare_replay
 from scanmap.session.rigs import TWIN_NAME, open_twin, opened_stage
 from scanmap.shot import Shot, decode_image
@@ -257,9 +258,11 @@ def _newest(
         begun = time.monotonic()
         try:
             frame: Frame = camera.newest() if isinstance(camera, Streaming) else camera.grab()
+        except NoMorePicturesError:
+            return
         except CameraError as error:
             faults += 1
-            if faults >= PATIENT_FRAMES or "no more pictures" in str(error):
+            if faults >= PATIENT_FRAMES:
                 raise
             say(f"fault: {error}")
             continue
