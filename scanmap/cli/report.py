@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -82,11 +83,23 @@ def print_summary(summary: Summary) -> None:
         return
     say("accuracy budget (sigma of a point):")
     table = Table()
-    for name in ("range", "points", "median mm", "95 % mm"):
+    stated = bool(summary.calibration)
+    for name in ("range", "points", "median mm", "95 % mm", *(("calibration mm",) if stated else ())):
         table.add_column(name, justify="left" if name == "range" else "right")
     for band in summary.budget:
-        table.add_row(band.name, str(band.points), f"{1e3 * band.sigma_median_m:.2f}", f"{1e3 * band.sigma_p95_m:.2f}")
+        row = [band.name, str(band.points), f"{1e3 * band.sigma_median_m:.2f}", f"{1e3 * band.sigma_p95_m:.2f}"]
+        table.add_row(*row, *((f"{1e3 * band.calibration_m:.2f}",) if stated else ()))
     console.print(table)
+    say(_calibration_words(summary))
+
+
+def _calibration_words(summary: Summary) -> str:
+    """What the calibration adds to the budget, common to all points of a range."""
+    if not summary.calibration:
+        return "calibration: it states no covariance, so its own error is not in this budget"
+    seen = [f"{1e3 * sigma:.2f} mm at {far:g} m" for far, sigma in summary.calibration if not math.isnan(sigma)]
+    words = ", ".join(seen) if seen else "no round range is in view"
+    return f"calibration: its own uncertainty (sigma, common to all points there) is {words}"
 
 
 def print_result(result: Result) -> None:

@@ -185,7 +185,7 @@ class Job:
 
     def _finished(self, scan: Scan, faults: list[str], ended: str, error: Exception | None) -> Result:
         clean = finished_scan(scan, self.config)
-        summary = summarise(clean)
+        summary = summarise(clean, self.calibration)
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
         if summary.points:
             grid = OccupancyGrid.from_scan(clean, self.config.grid)

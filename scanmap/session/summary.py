@@ -7,10 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from scanmap.calibration import Calibration
 from scanmap.laserline import Reason
 from scanmap.scan import Scan
+from scanmap.solvers.budget import calibration_sigma
 
 RANGE_BANDS_M = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, np.inf)
+CALIBRATION_AT_M = (1.0, 3.0, 5.0)  # where the budget states what the calibration adds
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,7 @@ class Band:
     points: int
     sigma_median_m: float
     sigma_p95_m: float
+    calibration_m: float  # what the calibration's own uncertainty adds at the median range; NaN if it states none
 
     @property
     def name(self) -> str:
@@ -41,10 +45,15 @@ class Summary:
     range_max_m: float
     lost: dict[Reason, int]  # cells without a point, by reason, most frequent first
     budget: tuple[Band, ...]  # bands that hold points
+    calibration: tuple[tuple[float, float], ...]  # range and the calibration's sigma there [m]; NaN out of view
 
 
-def summarise(scan: Scan) -> Summary:
-    """`Summary` of a scan; ranges are NaN where it has no point at all."""
+def summarise(scan: Scan, calibration: Calibration | None = None) -> Summary:
+    """`Summary` of a scan; ranges are NaN where it has no point at all.
+
+    Args:
+        calibration: the head it was made with; its covariance enters the budget.
+    """
     valid = scan.valid
     ranges = scan.range_m[valid]
     low, median, high = np.percentile(ranges, [0, 50, 100]) if ranges.size else (np.nan,) * 3
@@ -58,11 +67,12 @@ def summarise(scan: Scan) -> Summary:
         range_median_m=float(median),
         range_max_m=float(high),
         lost=dict(sorted(lost.items(), key=lambda item: -item[1])),
-        budget=_budget(scan),
+        budget=_budget(scan, calibration),
+        calibration=_calibration(calibration),
     )
 
 
-def _budget(scan: Scan) -> tuple[Band, ...]:
+def _budget(scan: Scan, calibration: Calibration | None) -> tuple[Band, ...]:
     valid = scan.valid
     ranges, sigma = scan.range_m[valid], scan.sigma_m[valid]
     band_of = np.digitize(ranges, RANGE_BANDS_M[1:-1])
@@ -71,5 +81,15 @@ def _budget(scan: Scan) -> tuple[Band, ...]:
         inside = sigma[band_of == k]
         if inside.size:
             median, p95 = np.percentile(inside, [50, 95])
-            bands.append(Band(near, far, int(inside.size), float(median), float(p95)))
+            middle = np.array([np.median(ranges[band_of == k])], np.float64)
+            own = float(calibration_sigma(calibration, middle)[0]) if calibration is not None else float("nan")
+            bands.append(Band(near, far, int(inside.size), float(median), float(p95), own))
     return tuple(bands)
+
+
+def _calibration(calibration: Calibration | None) -> tuple[tuple[float, float], ...]:
+    """The calibration's sigma at round ranges; none where it states no covariance."""
+    if calibration is None or not calibration.covariance:
+        return ()
+    sigma = calibration_sigma(calibration, np.array(CALIBRATION_AT_M))
+    return tuple((far, float(own)) for far, own in zip(CALIBRATION_AT_M, sigma, strict=True))

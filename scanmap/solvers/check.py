@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field
 from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import Uncertainty, moved, uncertainty_of
 from scanmap.errors import CalibrationError
+from scanmap.solvers.budget import deviations
 from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, beside, fitted_plane, grow
 from scanmap.solvers.passes import Passes, compare_passes
 from scanmap.solvers.self_calibration import Estimate, Refined, refine
@@ -225,14 +226,6 @@ class _Spread:
         """(D, N) displacement of the members along a normal [m]."""
         along: Array = np.nan_to_num(self.displacement[:, member] @ normal)
         return along
-
-
-def deviations(known: Uncertainty) -> Array:
-    """One-sigma steps (D, N) along the principal directions of a covariance, those that are not nil."""
-    values, vectors = np.linalg.eigh(known.matrix)
-    some = values > 1e-16 * max(float(values.max(initial=0.0)), 1e-300)
-    steps: Array = (vectors[:, some] * np.sqrt(values[some])).T
-    return steps
 
 
 def _wall(
