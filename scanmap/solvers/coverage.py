@@ -1,0 +1,86 @@
+"""Which parts of the picture and which tilts the views so far cover, and what to show next: live guidance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.solvers.board import Board
+from scanmap.solvers.board_pose import board_pose, rough_camera
+from scanmap.solvers.detection import View
+
+Array = NDArray[np.float64]
+
+VIEWS_LEAST, VIEWS_GOOD = 8, 20
+CELLS = (8, 6)  # of the picture, across and down
+COVERED_GOOD = 0.8  # [share of the cells]
+TILT_GOOD_DEG = 35.0
+# [share of the image width] views whose corners differ by less on average are one view.
+NEW_SHARE = 0.01
+
+
+class Coverage(NamedTuple):
+    """Corners per cell of the picture."""
+
+    counts: NDArray[np.intp]  # (rows, columns)
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that hold corners."""
+        return float((self.counts > 0).mean())
+
+
+def coverage_of(views: Sequence[View], size: tuple[int, int]) -> Coverage:
+    """`Coverage` of pictures of `size` = width, height [px]."""
+    corners = np.concatenate([view.corners for view in views]) if views else np.zeros((0, 2))
+    edges = [np.linspace(-0.5, extent - 0.5, cells + 1) for extent, cells in zip(size, CELLS, strict=True)]
+    counts, _, _ = np.histogram2d(corners[:, 1], corners[:, 0], bins=(edges[1], edges[0]))
+    return Coverage(counts.astype(np.intp))
+
+
+def is_new(view: View, before: Sequence[View], width: int) -> bool:
+    """Whether a view shows something that none before it showed."""
+    for old in before:
+        both, here, there = np.intersect1d(view.ids, old.ids, return_indices=True)
+        if len(both) >= 0.8 * len(view.ids):
+            apart = np.linalg.norm(view.corners[here] - old.corners[there], axis=1).mean()
+            if apart < NEW_SHARE * width:
+                return False
+    return True
+
+
+def tilt_spread_deg(poses: Array) -> float:
+    """Largest angle [deg] between the normals of boards with the poses (V, 4, 4)."""
+    normals = np.asarray(poses)[:, :3, 2]
+    return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))) if len(normals) else 0.0
+
+
+def hints(views: Sequence[View], poses: Array, size: tuple[int, int]) -> list[str]:
+    """What to show next, most needed first; empty when there is enough."""
+    wanted = []
+    if len(views) < VIEWS_GOOD:
+        wanted.append(f"{VIEWS_GOOD - len(views)} more views")
+    if tilt_spread_deg(poses) < TILT_GOOD_DEG:
+        wanted.append("tilt the board more, 20 to 40 deg up, down, left and right")
+    if coverage_of(views, size).share < COVERED_GOOD:
+        wanted.append(f"hold the board into the {_emptiest(coverage_of(views, size))} of the picture")
+    return wanted
+
+
+def guidance(views: Sequence[View], board: Board, size: tuple[int, int]) -> list[str]:
+    """`hints` before there is a camera: tilts are judged with an ordinary webcam's focal length."""
+    camera = rough_camera(size)
+    poses = [board_pose(view, board, camera).T_camera_board for view in views]
+    return hints(views, np.array([pose for pose in poses if np.isfinite(pose).all()]).reshape(-1, 4, 4), size)
+
+
+def _emptiest(coverage: Coverage) -> str:
+    names = [["upper left", "upper middle", "upper right"], ["left", "middle", "right"],
+             ["lower left", "lower middle", "lower right"]]  # fmt: skip
+    rows, columns = (np.array_split(np.arange(n), 3) for n in coverage.counts.shape)
+    empty = [[float((coverage.counts[np.ix_(r, c)] == 0).mean()) for c in columns] for r in rows]
+    at = np.unravel_index(np.argmax(empty), (3, 3))
+    return names[at[0]][at[1]]

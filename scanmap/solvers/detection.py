@@ -1,0 +1,213 @@
+"""Find a board in a picture: sub-pixel corners, or why there are none."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.shot import Image
+from scanmap.solvers.board import Board
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# A view counts from this share of the board's corners, and from this many.
+LEAST_SHARE, LEAST_CORNERS = 0.25, 12
+# [px] a corner may move when it is refined; one that moves further was none.
+MOVED_MOST_PX = 2.0
+# [10 to 90 % of an edge, as a share of a square] beyond it corners are no longer found evenly.
+BLUR_MOST = 0.3
+# Of the board's median contrast: a corner with less lies in glare, in a shadow or under a finger.
+CONTRAST_LEAST = 0.25
+# [share of a square] how far corners may lie from where a flat board has them (distortion bends it a little).
+BENT_MOST = 0.35
+
+
+class View(NamedTuple):
+    """A board found in a picture."""
+
+    name: str
+    ids: Index  # (N,) which of `Board.points`
+    corners: Array  # (N, 2) column, row [px]
+    blur_px: float  # 10 to 90 % of an edge
+    dropped: int  # corners given up for glare, shadow or a bad fit
+    bearing: float = float("nan")  # [rad] where the source knows it
+    marker_ratio: float = float("nan")  # measured side of a marker over side of a square; ChArUco
+
+
+class Rejected(NamedTuple):
+    """A picture without a usable board."""
+
+    name: str
+    reason: str
+
+
+def find_board(image: Image, board: Board, name: str = "", bearing: float = float("nan")) -> View | Rejected:
+    """Find the board in a grey (H, W) or BGR (H, W, 3) picture, laser on or off."""
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    if board.kind == "charuco":
+        found = _charuco(grey, board)
+    else:
+        found = _chessboard(grey, board)
+    if isinstance(found, str):
+        return Rejected(name, found)
+    ids, corners, ratio = found
+    spacing = _spacing(board, ids, corners)
+    if spacing < 5.0:
+        return Rejected(name, f"squares of {spacing:.1f} px are too small to measure; come closer")
+    refined, moved = _refined(grey, corners, spacing)
+    contrast, blur = _edges(grey, refined, spacing)
+    keep = (moved < MOVED_MOST_PX) & (contrast > CONTRAST_LEAST * np.median(contrast))
+    keep &= (refined >= 2).all(axis=1) & (refined < np.array(grey.shape[::-1]) - 3).all(axis=1)
+    if blur > max(4.0, BLUR_MOST * spacing):
+        return Rejected(name, f"blurred: an edge is {blur:.1f} px wide; hold still, focus, more light")
+    least = max(LEAST_CORNERS, int(LEAST_SHARE * len(board.points)))
+    if keep.sum() < min(least, len(board.points)):
+        why = "the rest are cut off, covered or in glare" if len(keep) < len(board.points) else "glare or shadow"
+        return Rejected(name, f"only {int(keep.sum())} of {len(board.points)} corners are clear: {why}")
+    if _on_one_line(board, ids[keep]):
+        return Rejected(name, "the corners in sight lie on one line")
+    fault = _not_flat(board, ids[keep], refined[keep], spacing)
+    if fault:
+        return Rejected(name, fault)
+    return View(name, ids[keep], refined[keep], blur, int((~keep).sum()), bearing, ratio)
+
+
+def seen_instead(image: Image, board: Board) -> str:
+    """What a picture without the board shows in its place, as far as it can be told; empty if nothing."""
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    if board.kind == "charuco":
+        if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board)[1]) >= 3:
+            return "the picture is mirrored: turn mirroring off in the camera"
+        _, ids = _markers(grey, board)
+        count = board.columns * board.rows // 2
+        others = [int(i) for i in ids if i >= count]
+        if others:
+            return f"marker {max(others)} is in sight, and {board.name} has 0 to {count - 1}: another board"
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(
+        grey, (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    )
+    if not found or meta is None:
+        return ""
+    across, down = int(meta.shape[1]), int(meta.shape[0])
+    if board.kind == "charuco" or {across, down} != set(board.corners):
+        return f"a chessboard of {across}x{down} inner corners is in sight"
+    return ""
+
+
+def _chessboard(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
+    across, down = board.corners
+    sweeps = (cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
+    for flags in sweeps:
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (across, down), flags | cv2.CALIB_CB_LARGER)
+        if not found:
+            continue
+        if meta is not None and {int(meta.shape[1]), int(meta.shape[0])} != {across, down}:
+            return f"a chessboard of {meta.shape[1]}x{meta.shape[0]} inner corners is in sight, not {across}x{down}"
+        if (int(meta.shape[1]), int(meta.shape[0])) == (across, down):
+            return np.arange(across * down), _right_handed(corners, across, down), np.nan
+    found, corners = cv2.findChessboardCorners(grey, (across, down))
+    if found:
+        return np.arange(across * down), _right_handed(corners, across, down), np.nan
+    return "no board found"
+
+
+def _right_handed(corners: Array, across: int, down: int) -> Array:
+    """Corners numbered so that x, y and the look at the board make a right-handed frame; a chessboard allows it."""
+    grid = np.asarray(corners, np.float64).reshape(down, across, 2)
+    x, y = grid[-1, -1] - grid[-1, 0], grid[-1, 0] - grid[0, 0]
+    return np.ascontiguousarray(grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]).reshape(-1, 2)
+
+
+def _markers(grey: Image, board: Board) -> tuple[Any, list[int]]:
+    detector = cv2.aruco.ArucoDetector(board.charuco().getDictionary(), cv2.aruco.DetectorParameters())
+    corners, ids, _ = detector.detectMarkers(grey)
+    return corners, [] if ids is None else [int(i) for i in ids.ravel()]
+
+
+def _charuco(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
+    pattern = board.charuco()
+    corners, ids, squares, marks = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
+    count = board.columns * board.rows // 2
+    strange = [] if marks is None else [int(i) for i in marks.ravel() if i >= count]
+    if len(strange) >= 2:
+        return f"markers {min(strange)} to {max(strange)} are in sight, and {board.name} has 0 to {count - 1}"
+    if ids is None or len(ids) < 4:
+        seen = 0 if marks is None else len(marks)
+        return "no board found" if not seen else f"only {seen} markers of the board could be read"
+    ids = np.asarray(ids).ravel().astype(np.intp)
+    corners = np.asarray(corners, np.float64).reshape(-1, 2)
+    return ids, corners, _marker_ratio(board, ids, corners, squares)
+
+
+def _marker_ratio(board: Board, ids: Index, corners: Array, markers: Any) -> float:
+    """Side of the markers over side of a square, measured by the homography of the corners."""
+    H, _ = cv2.findHomography(corners, board.points[ids, :2])
+    if H is None:
+        return float("nan")
+    flat = cv2.perspectiveTransform(np.concatenate([np.asarray(m).reshape(1, 4, 2) for m in markers], axis=1), H)
+    quads = flat.reshape(-1, 4, 2)
+    sides = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1)
+    return float(np.median(sides) / board.square_m)
+
+
+def _spacing(board: Board, ids: Index, corners: Array) -> float:
+    """Smallest distance between neighbouring corners [px]."""
+    across, down = board.corners
+    grid = np.full((down, across, 2), np.nan)
+    grid.reshape(-1, 2)[ids] = corners
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    known = np.concatenate(steps)
+    known = known[np.isfinite(known)]
+    return float(known.min()) if known.size else 0.0
+
+
+def _refined(grey: Image, corners: Array, spacing: float) -> tuple[Array, Array]:
+    """Corners (N, 2) to sub-pixel where the gradients around them are orthogonal to the way there, and how far they went.
+
+    Source: Foerstner and Guelch 1987, OpenCV's cornerSubPix.
+    """
+    half = int(np.clip(0.3 * spacing, 2, 12))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    refined = cv2.cornerSubPix(grey, corners.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), criteria)
+    refined = refined.reshape(-1, 2).astype(np.float64)
+    return refined, np.linalg.norm(refined - corners, axis=1)
+
+
+def _edges(grey: Image, corners: Array, spacing: float) -> tuple[Array, float]:
+    """Contrast (N,) around each corner [grey levels], and the median width of an edge, 10 to 90 % [px]."""
+    half = int(np.clip(0.4 * spacing, 3, 25))
+    height, width = grey.shape
+    contrast, widths = np.zeros(len(corners)), []
+    for k, (u, v) in enumerate(np.rint(corners).astype(int)):
+        patch = grey[max(0, v - half) : min(height, v + half + 1), max(0, u - half) : min(width, u + half + 1)]
+        if min(patch.shape) < 5:
+            continue
+        low, high = np.percentile(patch, [8, 92])
+        contrast[k] = high - low
+        smooth = cv2.GaussianBlur(patch.astype(np.float32), (0, 0), 0.7)
+        slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8)
+        widths.append(0.8 * contrast[k] / max(float(np.percentile(slope, 97)), 1e-3))
+    return contrast, float(np.median(widths)) if widths else np.inf
+
+
+def _on_one_line(board: Board, ids: Index) -> bool:
+    spread = np.linalg.svd(board.points[ids, :2] - board.points[ids, :2].mean(axis=0), compute_uv=False)
+    return bool(spread[1] < board.square_m)
+
+
+def _not_flat(board: Board, ids: Index, corners: Array, spacing: float) -> str:
+    """Whether the corners lie where no view of a flat board has them; the fault in words, or empty."""
+    flat = board.points[ids, :2].astype(np.float64)
+    H, _ = cv2.findHomography(flat, corners)
+    if H is None:
+        return "the corners are no view of a flat board"
+    off = np.linalg.norm(cv2.perspectiveTransform(flat[:, None], H)[:, 0] - corners, axis=1)
+    if np.median(off) > BENT_MOST * spacing:
+        return f"the corners are no view of {board.name}: is that the board, and is it flat?"
+    if np.linalg.det(H) * H[2, 2] < 0:
+        return "the picture is mirrored: turn mirroring off in the camera"
+    return ""
