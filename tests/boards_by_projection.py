@@ -142,10 +142,18 @@ def axis_views(
 
 
 def picture_of(
-    head: Head, board: Board, T: Array, rng: np.random.Generator, *, laser: bool = False, noise: float = 1.5,
-    light: float = 1.0, blur_px: float = 0.6, samples: int = 4,
+    head: Head,
+    board: Board,
+    T: Array,
+    rng: np.random.Generator,
+    *,
+    laser: bool = False,
+    noise: float = 1.5,
+    light: float = 1.0,
+    blur_px: float = 0.6,
+    samples: int = 4,
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR picture of the board before a dim wall, its edges antialiased by `samples` x `samples` rays a pixel.
+    """(H, W, 3) BGR picture of the board before a dim wall, antialiased by `samples` x `samples` rays a pixel.
 
     `light` falls off across the picture: 1 for even light.
     """
@@ -170,7 +178,7 @@ def picture_of(
     return np.clip(np.rint(bgr), 0, 255).astype(np.uint8)
 
 
-def board_texture(board: Board):  # noqa: ANN201
+def board_texture(board: Board):
     """Function of board coordinates (..., 2) [m]: 1 white, 0 black, 0.2 beyond the sheet."""
     first = board.outline()[0, :2]
     across, down = board.squares

@@ -36,6 +36,8 @@ GATES = {
 def faults_of(calibration: Calibration) -> list[str]:
     """Every stated residual over its gate, in words; a residual that is no number is one too."""
     faults = []
+    if "laser plane" in calibration.meta.get("uncalibrated", ()):
+        faults.append("its laser plane is not calibrated yet; scanmap calibrate laser")
     for key, gate in GATES.items():
         if key not in calibration.residuals:
             continue
@@ -51,4 +53,4 @@ def check_residuals(calibration: Calibration) -> None:
     """Raise CalibrationError where a calibration states a residual over its gate: no scan is made with it."""
     faults = faults_of(calibration)
     if faults:
-        raise CalibrationError(f"calibration refused: {'; '.join(faults)} makes a better one")
+        raise CalibrationError(f"calibration refused: {'; '.join(faults)} sets it right")

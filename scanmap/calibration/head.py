@@ -81,14 +81,38 @@ class Calibration:
             angle = replace(angle, rpc_deg=angle.rpc_deg / sx, ro_deg=angle.ro_deg + half)
         return replace(self, intrinsics=intrinsics, ratio=ratio, pixel_angle=angle)
 
+    def rescaled(self, width: int, height: int) -> Calibration:
+        """`scaled_to` for a file: refuses another aspect, and carries what is stated in pixels along.
+
+        Raises:
+            CalibrationError: another aspect cannot show the same field of view.
+        """
+        own = self.intrinsics
+        if abs(width * own.height - height * own.width) > 0.5 * max(own.width, own.height):
+            raise CalibrationError(
+                f"{width}x{height} has another aspect than the calibration's {own.width}x{own.height}: it cannot show "
+                "the same field of view; calibrate the camera at that size"
+            )
+        scaled = self.scaled_to(width, height)
+        by = {"fx": width / own.width, "cx": width / own.width, "fy": height / own.height, "cy": height / own.height}
+        covariance = dict(self.covariance)
+        if covariance:
+            factor = np.array([by.get(name, 1.0) for name in covariance["parameters"]])
+            covariance["matrix"] = (np.array(covariance["matrix"]) * np.outer(factor, factor)).tolist()
+        residuals = {
+            name: value * width / own.width if name.endswith("_px") else value for name, value in self.residuals.items()
+        }
+        meta = {**self.meta, "scaled_from": f"{own.width}x{own.height}"}
+        return replace(scaled, covariance=covariance, residuals=residuals, meta=meta)
+
     def check_image(self, width: int, height: int) -> None:
         """Raise CalibrationError unless images of this size belong to this calibration."""
         own = self.intrinsics
         if (width, height) != (own.width, own.height):
             raise CalibrationError(
                 f"image is {width}x{height}, the calibration is for {own.width}x{own.height}; "
-                f"set the camera to {own.width}x{own.height} or give the calibration of these images "
-                "with --calibration"
+                f"set the camera to {own.width}x{own.height}, give the calibration of these images "
+                f"with --calibration, or make it: scanmap calibrate scale F.toml --size {width}x{height} --out G.toml"
             )
 
     @classmethod

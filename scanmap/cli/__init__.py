@@ -13,6 +13,7 @@ import typer
 
 from scanmap import __version__
 from scanmap.cli import (
+    boards,
     calibrating,
     designing,
     hardware,
@@ -50,6 +51,8 @@ calibrating.calibrate.command()(tabling.table)
 calibrating.calibrate.command("self")(judging.self_)
 calibrating.calibrate.command()(judging.check)
 calibrating.calibrate.command()(latency.latency)
+app.command()(boards.board)
+calibrating.calibrate.command()(boards.scale)
 app.add_typer(calibrating.calibrate)
 app.command()(designing.design)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from scanmap import config as configuration
-from scanmap.calibration import Calibration
+from scanmap.calibration import Calibration, check_residuals
 from scanmap.config import Config
 from scanmap.errors import ConfigError, RecordingError
 from scanmap.recording import Recorder, Source, open_source
@@ -73,6 +73,7 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
     if view:
         require_display(INSTEAD_OF_VIEW)
     head = choice.head() or config.head()
+    check_residuals(head)
     swept = plan(config.sweep, _limits(config))
     opened = open_rig(config, head)
     is_twin = opened.rig.is_twin
@@ -117,9 +118,11 @@ def prepare_replay(
     outputs.check()
     if view:
         require_display(INSTEAD_OF_VIEW)
+    head = choice.head() or (config.head() if config.calibration is not None else source.calibration())
+    check_residuals(head)
     job = Job(
         config=config,
-        calibration=choice.head() or (config.head() if config.calibration is not None else source.calibration()),
+        calibration=head,
         outputs=outputs,
         shots=source.shots,
         total=source.count,

@@ -80,11 +80,14 @@ def calibrate_axis(views: Sequence[View], board: Board, calibration: Calibration
         worst = int(rms.argmax())
         if rms[worst] <= max(ODD_TIMES * float(np.median(rms)), ODD_PX):
             break
-        rejected.append(Rejected(good[worst].name, f"contradicts the others: {rms[worst]:.1f} px rms; did the board move?"))
+        rejected.append(
+            Rejected(good[worst].name, f"contradicts the others: {rms[worst]:.1f} px rms; did the board move?")
+        )
         del good[worst]
         if len(rejected) > ODD_SHARE * len(views):
             raise CalibrationError(
-                f"{len(rejected)} of {len(views)} views contradict the others: the board must stand still while the head "
+                f"{len(rejected)} of {len(views)} views contradict the others: the board must stand still while "
+                "the head "
                 "turns, and the bearings must be those of the pictures"
             )
         _require(good)
@@ -120,7 +123,8 @@ def _require(views: Sequence[View]) -> None:
     span = _span_deg(views)
     if span < SPAN_LEAST_DEG:
         raise CalibrationError(
-            f"the board is in sight over {span:.1f} deg of bearing; at least {SPAN_LEAST_DEG:g} are needed: put it farther "
+            f"the board is in sight over {span:.1f} deg of bearing; at least {SPAN_LEAST_DEG:g} are needed: put "
+            "it farther "
             "away, and sweep from one edge of the picture to the other"
         )
 
@@ -246,7 +250,10 @@ def _solve(views: Sequence[View], board: Board, calibration: Calibration, start:
 
     def off(x: Array) -> Array:
         # A guess that puts corners behind the camera is merely a bad one.
-        return np.nan_to_num(np.concatenate([r.ravel() for r in _residuals(x, views, board, calibration)]), nan=1e3)
+        flat: Array = np.nan_to_num(
+            np.concatenate([r.ravel() for r in _residuals(x, views, board, calibration)]), nan=1e3
+        )
+        return flat
 
     found = least_squares(off, start, x_scale="jac", loss="soft_l1", f_scale=1.0, max_nfev=60)
     J, count = found.jac, len(found.fun)
@@ -275,7 +282,8 @@ def _checked(fit: AxisFit, calibration: Calibration) -> AxisFit:
     limit = GATES["axis_rms_px"].limit_at(calibration.intrinsics.width)
     if fit.rms_px > limit:
         raise CalibrationError(
-            f"corners miss the turn about one axis by {fit.rms_px:.2f} px rms, over the gate of {limit:.2f}: does the head "
+            f"corners miss the turn about one axis by {fit.rms_px:.2f} px rms, over the gate of {limit:.2f}: "
+            "does the head "
             "wobble, did the board move, are the bearings right?"
         )
     sigma = np.sqrt(np.diag(fit.own))
@@ -283,6 +291,7 @@ def _checked(fit: AxisFit, calibration: Calibration) -> AxisFit:
     if offset > OFFSET_SIGMA_MOST_M or tilt > TILT_SIGMA_MOST_DEG:
         raise CalibrationError(
             f"the axis is only known to {1e3 * offset:.1f} mm and {tilt:.2f} deg ({1e3 * OFFSET_SIGMA_MOST_M:g} mm and "
-            f"{TILT_SIGMA_MOST_DEG:g} deg needed): more bearings over a wider turn, with the board larger in the picture"
+            f"{TILT_SIGMA_MOST_DEG:g} deg needed): more bearings over a wider turn, with the board larger in the "
+            "picture"
         )
     return fit

@@ -104,12 +104,14 @@ def parse_board(name: str) -> Board:
 
 
 def _fault(board: Board, *, has_marker: bool) -> str:
-    if not (3 <= min(board.corners) and max(board.corners) <= 40):
+    if not (min(board.corners) >= 3 and max(board.corners) <= 40):
         return f"{board.corners[0]}x{board.corners[1]} inner corners; 3 to 40 each way can be found"
     if not 1e-3 <= board.square_m <= 1.0:
         return f"a square of {1e3 * board.square_m:g} mm; 1 mm to 1 m makes sense"
     if board.kind == "chessboard":
         return "a chessboard has no markers" if has_marker else ""
     if not 0.3 * board.square_m <= board.marker_m <= 0.9 * board.square_m:
-        return f"markers of {1e3 * board.marker_m:g} mm in squares of {1e3 * board.square_m:g} mm; 30 to 90 % can be read"
+        return (
+            f"markers of {1e3 * board.marker_m:g} mm in squares of {1e3 * board.square_m:g} mm; 30 to 90 % can be read"
+        )
     return ""

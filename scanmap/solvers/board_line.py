@@ -60,14 +60,14 @@ def find_board_line(
     """
     view, pose = _steady(view, board, intrinsics)
     if not np.isfinite(pose.residuals).all() or pose.rms_px > 2.0 * max(1.0, intrinsics.width / 1600.0):
-        return Rejected(view.name, f"the board fits the camera only to {pose.rms_px:.1f} px rms: another camera or board?")
+        return Rejected(
+            view.name, f"the board fits the camera only to {pose.rms_px:.1f} px rms: another camera or board?"
+        )
     window = board_window(pose, board, intrinsics, margin_m)
     line = find_laser_line(image, params, background, window)
     rows = np.flatnonzero(line.reason == Reason.OK)
     if len(rows) < ROWS_LEAST:
-        return Rejected(
-            view.name, f"laser not visible on the board: {len(rows)} rows with a line, {ROWS_LEAST} needed"
-        )
+        return Rejected(view.name, f"laser not visible on the board: {len(rows)} rows with a line, {ROWS_LEAST} needed")
     columns = line.column_px[rows]
     inner = board_window(pose, board, intrinsics, 0.0)[rows]
     on_squares = (columns >= inner[:, 0]) & (columns <= inner[:, 1])
@@ -109,10 +109,10 @@ def straight_rows(
     i, j = (sample[k] for k in np.triu_indices(len(sample), 8))
     slope = (x[j] - x[i]) / (y[j] - y[i])
     off = np.abs(x[None, :] - x[i, None] - slope[:, None] * (y[None, :] - y[i, None]))
-    best = off[np.argmax((off[:, sure] < tolerance).sum(axis=1))] < tolerance
+    best: NDArray[np.bool_] = off[np.argmax((off[:, sure] < tolerance).sum(axis=1))] < tolerance
     for _ in range(3):
         fit = np.polynomial.Polynomial.fit(y[best], x[best], 1)
-        best = np.abs(x - fit(y)) < tolerance
+        best = np.asarray(np.abs(x - fit(y)) < tolerance)
         if best.sum() < 8:
             break
     return best

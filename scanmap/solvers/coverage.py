@@ -19,7 +19,7 @@ CELLS = (8, 6)  # of the picture, across and down
 COVERED_GOOD = 0.8  # [share of the cells]
 TILT_GOOD_DEG = 35.0
 # [share of the image width] views whose corners differ by less on average are one view.
-NEW_SHARE = 0.01
+NEW_SHARE = 0.005
 
 
 class Coverage(NamedTuple):

@@ -48,10 +48,7 @@ class Rejected(NamedTuple):
 def find_board(image: Image, board: Board, name: str = "", bearing: float = float("nan")) -> View | Rejected:
     """Find the board in a grey (H, W) or BGR (H, W, 3) picture, laser on or off."""
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-    if board.kind == "charuco":
-        found = _charuco(grey, board)
-    else:
-        found = _chessboard(grey, board)
+    found = _charuco(grey, board) if board.kind == "charuco" else _chessboard(grey, board)
     if isinstance(found, str):
         return Rejected(name, found)
     ids, corners, ratio = found
@@ -115,7 +112,7 @@ def _chessboard(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
     return "no board found"
 
 
-def _right_handed(corners: Array, across: int, down: int) -> Array:
+def _right_handed(corners: Any, across: int, down: int) -> Array:
     """Corners numbered so that x, y and the look at the board make a right-handed frame; a chessboard allows it."""
     grid = np.asarray(corners, np.float64).reshape(down, across, 2)
     x, y = grid[-1, -1] - grid[-1, 0], grid[-1, 0] - grid[0, 0]
@@ -135,12 +132,12 @@ def _charuco(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
     strange = [] if marks is None else [int(i) for i in marks.ravel() if i >= count]
     if len(strange) >= 2:
         return f"markers {min(strange)} to {max(strange)} are in sight, and {board.name} has 0 to {count - 1}"
-    if ids is None or len(ids) < 4:
+    if ids is None or corners is None or len(ids) < 4:
         seen = 0 if marks is None else len(marks)
         return "no board found" if not seen else f"only {seen} markers of the board could be read"
-    ids = np.asarray(ids).ravel().astype(np.intp)
-    corners = np.asarray(corners, np.float64).reshape(-1, 2)
-    return ids, corners, _marker_ratio(board, ids, corners, squares)
+    which = np.asarray(ids).ravel().astype(np.intp)
+    where = np.asarray(corners, np.float64).reshape(-1, 2)
+    return which, where, _marker_ratio(board, which, where, squares)
 
 
 def _marker_ratio(board: Board, ids: Index, corners: Array, markers: Any) -> float:
@@ -166,14 +163,14 @@ def _spacing(board: Board, ids: Index, corners: Array) -> float:
 
 
 def _refined(grey: Image, corners: Array, spacing: float) -> tuple[Array, Array]:
-    """Corners (N, 2) to sub-pixel where the gradients around them are orthogonal to the way there, and how far they went.
+    """Corners (N, 2) to sub-pixel, where the gradients around stand across the way there; and how far they went.
 
     Source: Foerstner and Guelch 1987, OpenCV's cornerSubPix.
     """
     half = int(np.clip(0.3 * spacing, 2, 12))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    refined = cv2.cornerSubPix(grey, corners.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), criteria)
-    refined = refined.reshape(-1, 2).astype(np.float64)
+    found = cv2.cornerSubPix(grey, corners.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), criteria)
+    refined = np.asarray(found, np.float64).reshape(-1, 2)
     return refined, np.linalg.norm(refined - corners, axis=1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -96,7 +96,8 @@ def distorted_camera(intrinsics: Intrinsics) -> tuple[Array, Array]:
 def _require_views(count: int, after: str) -> None:
     if count < VIEWS_LEAST:
         raise CalibrationError(
-            f"{count} usable views{after}; at least {VIEWS_LEAST} are needed, 20 are good: hold the board near and far, "
+            f"{count} usable views{after}; at least {VIEWS_LEAST} are needed, 20 are good: hold the board near "
+            "and far, "
             "tilted up, down, left and right, into every corner of the picture"
         )
 
@@ -106,7 +107,7 @@ def _solve(views: Sequence[View], board: Board, size: tuple[int, int]) -> tuple[
     corners = [view.corners.astype(np.float32)[:, None] for view in views]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     try:
-        _, K, k, turns, shifts = cv2.calibrateCamera(objects, corners, size, None, None, criteria=criteria)  # type: ignore[call-overload]
+        _, K, k, turns, shifts = cv2.calibrateCamera(objects, corners, size, None, None, criteria=criteria)
     except cv2.error as error:
         raise CalibrationError("no camera fits these views: are all of them of one camera and one board?") from error
     k = np.asarray(k).ravel()
@@ -124,7 +125,7 @@ def _solve(views: Sequence[View], board: Board, size: tuple[int, int]) -> tuple[
     return intrinsics, poses, residuals
 
 
-def _pose(turn: Array, shift: Array) -> Array:
+def _pose(turn: Any, shift: Any) -> Array:
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(turn)[0]
     T[:3, 3] = np.asarray(shift).ravel()
@@ -165,7 +166,8 @@ def _checked(fit: CameraFit, size: tuple[int, int]) -> CameraFit:
         )
     if fit.rms_px > limit:
         raise CalibrationError(
-            f"corners miss the camera model by {fit.rms_px:.2f} px rms, over the gate of {limit:.2f}: is the board flat, "
+            f"corners miss the camera model by {fit.rms_px:.2f} px rms, over the gate of {limit:.2f}: is the "
+            "board flat, "
             "the focus fixed, and every picture still?"
         )
     sigma = max(fit.uncertainty.sigma("fx") / own.fx, fit.uncertainty.sigma("fy") / own.fy)

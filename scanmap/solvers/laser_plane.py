@@ -84,11 +84,14 @@ def fit_laser_plane(lines: Sequence[BoardLine], board: Board, intrinsics: Intrin
         # A board that says the same as the others, only less well, stays.
         if median[worst] <= max(bound / 2, 6.0 * float(np.median(median))):
             break
-        rejected.append(Rejected(lines[good[worst]].view.name, f"its line is {median[worst]:.1f} px off the others' plane"))
+        rejected.append(
+            Rejected(lines[good[worst]].view.name, f"its line is {median[worst]:.1f} px off the others' plane")
+        )
         del good[worst]
         if len(rejected) > ODD_SHARE * len(lines):
             raise CalibrationError(
-                f"the lines on {len(rejected)} of {len(lines)} boards lie on no common plane: is the laser one straight "
+                f"the lines on {len(rejected)} of {len(lines)} boards lie on no common plane: is the laser one "
+                "straight "
                 "line, fixed to the camera, and is the camera's calibration of this camera?"
             )
     _require_lines(len(good), f" after {len(rejected)} that contradict the others")
@@ -165,7 +168,8 @@ def plane_in_camera(calibration: Calibration) -> Array:
 def _require_lines(count: int, after: str) -> None:
     if count < LINES_LEAST:
         raise CalibrationError(
-            f"the laser line is usable on {count} boards{after}; at least {LINES_LEAST} are needed, 15 are good: hold the "
+            f"the laser line is usable on {count} boards{after}; at least {LINES_LEAST} are needed, 15 are good: "
+            "hold the "
             "board near and far and turned both ways, with the line across its squares"
         )
 
@@ -197,7 +201,10 @@ def _consensus(clouds: Sequence[tuple[Array, Array]], width: int) -> Array:
     for i, j in combinations(chosen, 2):
         found = fit_plane(np.concatenate([few[i], few[j]]))
         plane = np.append(found.normal, found.d)
-        off = [np.median(np.abs(_off_px(plane, (p, d[:: max(1, len(d) // 12)])))) for p, (_, d) in zip(few, clouds, strict=True)]
+        off = [
+            np.median(np.abs(_off_px(plane, (p, d[:: max(1, len(d) // 12)]))))
+            for p, (_, d) in zip(few, clouds, strict=True)
+        ]
         # Full marks on the plane, none beyond the bound.
         value = float(np.clip(1.0 - np.array(off) / bound, 0.0, None).sum())
         if value > score:
@@ -271,7 +278,8 @@ def _checked(fit: LaserFit, intrinsics: Intrinsics) -> LaserFit:
     near, far = fit.depths_m
     if far < DEPTH_RATIO_LEAST * near:
         raise CalibrationError(
-            f"all boards are at one distance ({near:.2f} to {far:.2f} m), which leaves the laser plane's direction open: "
+            f"all boards are at one distance ({near:.2f} to {far:.2f} m), which leaves the laser plane's "
+            "direction open: "
             "hold the board near and far"
         )
     limit = GATES["laser_rms_px"].limit_at(intrinsics.width)
@@ -286,7 +294,8 @@ def _checked(fit: LaserFit, intrinsics: Intrinsics) -> LaserFit:
     offset = float(np.sqrt(max(middle @ fit.covariance @ middle, 0.0)))
     if angle > ANGLE_SIGMA_MOST_DEG or offset > OFFSET_SIGMA_MOST_M:
         raise CalibrationError(
-            f"the laser plane is only known to {angle:.2f} deg and {1e3 * offset:.2f} mm ({ANGLE_SIGMA_MOST_DEG} deg and "
+            f"the laser plane is only known to {angle:.2f} deg and {1e3 * offset:.2f} mm ({ANGLE_SIGMA_MOST_DEG} "
+            "deg and "
             f"{1e3 * OFFSET_SIGMA_MOST_M:g} mm needed): more boards, nearer and farther, turned both ways"
         )
     return fit

@@ -1,0 +1,191 @@
+"""Pictures to calibrate from: a folder, a video, a recording, or whatever a camera delivers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from scanmap.errors import CalibrationError, CameraError, RecordingError
+from scanmap.recording import open_source
+from scanmap.recording.frames import SUFFIXES
+from scanmap.recording.video import VIDEO_SUFFIXES
+from scanmap.shot import Image, Shot, decode_image
+from scanmap.solvers.board import Board
+from scanmap.solvers.coverage import is_new
+from scanmap.solvers.detection import Rejected, View, find_board, seen_instead
+
+# Of a video without bearings this many pictures are taken, evenly.
+VIDEO_PICTURES = 120
+# [share] by which markers may measure larger or smaller against their squares than they should.
+RATIO_MOST = 0.05
+
+
+class Picture(NamedTuple):
+    """One picture, decoded."""
+
+    name: str
+    image: Image  # (H, W, 3) BGR
+    background: Image | None = None  # the same with the laser off
+    bearing: float = float("nan")  # [rad]
+
+
+@dataclass
+class Views:
+    """What became of the pictures so far."""
+
+    board: Board
+    size: tuple[int, int] = (0, 0)  # width, height of the pictures [px]
+    views: list[View] = field(default_factory=list)
+    rejected: list[Rejected] = field(default_factory=list)
+    instead: str = ""  # what the first pictures without the board show in its place
+
+    def require(self) -> None:
+        """Raise CalibrationError where no picture shows the board at all; says what they show."""
+        if self.views:
+            self._require_ratio()
+            return
+        if not self.rejected:
+            raise CalibrationError("there is no picture to calibrate from")
+        why = self.instead or self.rejected[0].reason
+        raise CalibrationError(
+            f"{self.board.name} is in none of {len(self.rejected)} pictures: {why}; is --board what you printed?"
+        )
+
+    def _require_ratio(self) -> None:
+        """Raise CalibrationError where the markers are not as large against the squares as the board's name says."""
+        ratios = np.array([view.marker_ratio for view in self.views])
+        if self.board.kind != "charuco" or not np.isfinite(ratios).any():
+            return
+        seen, said = float(np.nanmedian(ratios)), self.board.marker_m / self.board.square_m
+        if abs(seen / said - 1.0) > RATIO_MOST:
+            raise CalibrationError(
+                f"the markers measure {seen:.3f} of a square, --board {self.board.name} says {said:.3f}: one of "
+                "its two "
+                f"lengths is wrong; measure both on the print"
+            )
+
+
+def read_pictures(path: Path) -> Iterator[Picture | Rejected]:
+    """The pictures of a folder, a video or a recording, in order; bearings where it has them.
+
+    Raises:
+        RecordingError: there is nothing to read.
+    """
+    if not path.exists():
+        raise RecordingError(
+            f"{path} does not exist; SOURCE is a folder of pictures, a video, a recording (.mcap), or `camera`"
+        )
+    if path.is_dir() and not (path / "scan.csv").exists() and not any(path.glob("*.mcap")):
+        return _of_folder(path)
+    csvs = (path.with_suffix(".csv"), path.parent / "scan.csv", path.parent / "bearings.csv")
+    if path.suffix.lower() in VIDEO_SUFFIXES and not any(csv.is_file() for csv in csvs):
+        return _of_video(path)
+    if path.suffix.lower() in SUFFIXES:
+        raise RecordingError(f"{path} is one picture; give the folder that holds all of them")
+    return pictures_of(open_source(path).shots())
+
+
+def pictures_of(shots: Iterable[Shot]) -> Iterator[Picture | Rejected]:
+    """The pictures of shots; one that is damaged is rejected."""
+    for shot in shots:
+        name = f"shot {shot.index} at {np.degrees(shot.bearing):.2f} deg"
+        try:
+            image = _whole(shot.image)
+            background = _whole(shot.background) if shot.background is not None else None
+        except CameraError as error:
+            yield Rejected(name, str(error))
+            continue
+        if background is not None and background.shape != image.shape:
+            background = None
+        yield Picture(name, image, background, shot.bearing)
+
+
+def _whole(data: bytes) -> Image:
+    decoded = decode_image(data)
+    if decoded.rows_valid < len(decoded.image):
+        raise CameraError(f"the picture is cut off after {decoded.rows_valid} of {len(decoded.image)} rows")
+    return decoded.image
+
+
+def collect(
+    pictures: Iterable[Picture | Rejected],
+    board: Board,
+    *,
+    use: Callable[[Picture, View], Rejected | None] = lambda picture, view: None,
+    distinct: bool = False,
+    report: Callable[[Views, View | Rejected], bool] = lambda views, last: True,
+) -> Views:
+    """Find the board in every picture.
+
+    Args:
+        use: what else a picture is good for; gives a `Rejected` where it is good for nothing.
+        distinct: leave out what shows no more than an earlier view did.
+        report: told of every picture; False ends it.
+    """
+    views = Views(board)
+    for picture in pictures:
+        last = picture if isinstance(picture, Rejected) else _judged(picture, views, use, distinct)
+        if isinstance(last, View):
+            views.views.append(last)
+        else:
+            views.rejected.append(last)
+        if not report(views, last):
+            break
+    return views
+
+
+def _judged(
+    picture: Picture, views: Views, use: Callable[[Picture, View], Rejected | None], distinct: bool
+) -> View | Rejected:
+    height, width = picture.image.shape[:2]
+    if views.size == (0, 0):
+        views.size = (width, height)
+    if views.size != (width, height):
+        return Rejected(picture.name, f"is {width}x{height}, the others are {views.size[0]}x{views.size[1]}")
+    seen = picture.image if picture.background is None else picture.background
+    found = find_board(seen, views.board, picture.name, picture.bearing)
+    if isinstance(found, Rejected):
+        if not views.views and not views.instead and len(views.rejected) < 5:
+            views.instead = seen_instead(seen, views.board)
+        return found
+    if distinct and not is_new(found, views.views, width):
+        return Rejected(picture.name, "shows the same as an earlier view")
+    return use(picture, found) or found
+
+
+def _of_folder(path: Path) -> Iterator[Picture | Rejected]:
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not files:
+        raise RecordingError(f"folder {path} holds no pictures ({', '.join(SUFFIXES)})")
+    return _decoded(files)
+
+
+def _decoded(files: list[Path]) -> Iterator[Picture | Rejected]:
+    for file in files:
+        try:
+            yield Picture(file.name, _whole(file.read_bytes()))
+        except (CameraError, OSError) as error:
+            yield Rejected(file.name, str(error))
+
+
+def _of_video(path: Path) -> Iterator[Picture]:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise RecordingError(f"video {path} cannot be opened: no video, damaged, or a codec that OpenCV lacks")
+    count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    every = max(1, count // VIDEO_PICTURES)
+    number = 0
+    try:
+        while capture.grab():
+            if number % every == 0:
+                ok, pixels = capture.retrieve()
+                if ok:
+                    yield Picture(f"frame {number}", np.asarray(pixels, np.uint8))
+            number += 1
+    finally:
+        capture.release()
