@@ -20,7 +20,12 @@ _MANY = 0.3  # share of the rows
 
 
 def laser_channel(image: U8) -> int:
-    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour.
+    """Channel (0 blue, 1 green, 2 red) of a BGR image in which a narrow bright line stands out by its colour."""
+    return judged_channel(image)[0]
+
+
+def judged_channel(image: U8) -> tuple[int, bool]:
+    """The laser's channel (0 blue, 1 green, 2 red) in a BGR image, and whether there is no doubt about it.
 
     Measured on some pairs of rows: how far the best place rises above both its sides in the channel and in the
     channel's lead over the other two, whichever is less, and in both rows; the better half of the pairs counts. So
@@ -35,18 +40,19 @@ def laser_channel(image: U8) -> int:
         rows = [plane[:n] for plane in planes]
         blazing = _blazing_channel(rows)
         if blazing is not None:
-            return blazing
+            return blazing, True
         upper, lower = _by_colour(planes).reshape(3, 2, n, -1).swapaxes(0, 1).reshape(2, 3 * n, -1)
         both = np.asarray(cv2.min(upper, cv2.dilate(lower, np.ones((1, 5), np.uint8))), np.uint8)
         best = np.sort(both.max(axis=1).reshape(3, n), axis=1)
         strength = [float(rising[n // 2 :].mean()) for rising in best]
         second, first = sorted(strength)[1:]
-        if first > max(_CLEAR_RATIO * second, _CLEAR):
+        clear = first > max(_CLEAR_RATIO * second, _CLEAR)
+        if clear:
             break
     # A grey picture in three channels has no lead at all: then the brightest line counts.
     if first <= 1.0:
         strength = [float(_ridge(plane, max(9, image.shape[1] // 96)).max(axis=1).mean()) for plane in rows]
-    return int(np.argmax(strength))
+    return int(np.argmax(strength)), clear
 
 
 def _planes(rows: U8) -> list[U8]:

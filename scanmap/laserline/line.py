@@ -46,7 +46,7 @@ _BLOCKS_ROWS = 18
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
 # the sigmas to be believed, and may fall below them once they are known to be wrong.
-_APART_ROWS, _MORE, _LESS = (5, 6), 1.12, 0.5
+_APART_ROWS, _MORE, _LESS = (5, 6), 1.08, 0.5
 
 
 class Reason(IntEnum):
@@ -146,7 +146,7 @@ def find_laser_line(
     if window is None:
         window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
     if params.method == "brightest":
-        channel = channel_of(image, background, params.grey) if image.ndim == 3 else None
+        channel = channel_of(image, background, params.grey)[0] if image.ndim == 3 else None
         return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
     if not np.isfinite(window).any():
         return _nothing(len(image), Reason.WINDOW)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, is_large, noise_of
-from scanmap.laserline.channel import laser_channel
+from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
 
@@ -44,12 +44,12 @@ class Sight(NamedTuple):
 
 def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     """Look at a grey (H, W) or BGR picture (H, W, 3), with the laser-off frame of the same view or None."""
-    if image.ndim == 3 and how.grey in ("auto", *CHANNEL) and without_colour(image):
-        # A monochrome camera's picture in three equal channels.
-        image, background = image[..., 1], background if background is None else background[..., 1]
     channel = None
     if image.ndim == 3:
-        channel = channel_of(image, background, how.grey)
+        channel, clear = channel_of(image, background, how.grey)
+        if channel is not None and not clear and without_colour(image):
+            # A monochrome camera's picture in three equal channels.
+            channel, image, background = None, image[..., 1], background if background is None else background[..., 1]
     if channel is not None and background is None:
         rows = np.asarray(cv2.extractChannel(quick_rows(image), channel), np.uint8)
         # Most of a large picture is never looked at.
@@ -64,11 +64,14 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows))
 
 
-def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
-    """The channel of a BGR picture that the line is looked for in; None for a conversion that mixes them."""
+def channel_of(image: U8, background: U8 | None, grey: Grey) -> tuple[int | None, bool]:
+    """The channel of a BGR picture that the line is looked for in, and whether the laser is surely seen there.
+
+    None for a conversion that mixes the channels.
+    """
     if grey == "auto":
-        return laser_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
-    return CHANNEL.get(grey)
+        return judged_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
+    return CHANNEL.get(grey), False
 
 
 def quick_rows(image: U8) -> U8:
