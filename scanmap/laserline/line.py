@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import pool, segments, unexplained
+from scanmap.laserline.result import LaserLine, Reason, no_line, without
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
 from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
@@ -48,53 +48,8 @@ _CORE_SHARE, _CORE_HALF = 0.4, 13
 # the sigmas to be believed, and may fall below them once they are known to be wrong.
 _APART_ROWS, _MORE, _LESS = (5, 6), 1.08, 0.5
 
-
-class Reason(IntEnum):
-    """Why a row has no point. One list from image to range image, so that a summary can add them up."""
-
-    OK = 0
-    WEAK = 1  # no peak above the noise
-    WIDE = 2  # too wide to be the laser line: lamp, window, halo
-    WINDOW = 3  # only outside the columns that geometry allows
-    AMBIGUOUS = 4  # several candidates, none clearly the line
-    EDGE = 5  # cut by the image border or by a depth edge too close to correct
-    DAMAGED = 6  # the image has no data here
-    BELOW_RANGE = 7  # nearer than the model or range_min allows
-    BEYOND_RANGE = 8  # farther than range_max, or at infinity
-    OUTLIER = 9  # removed by the filter over neighbours in the range image
-    NOT_SCANNED = 10  # no shot covers this cell
-    NARROW = 11  # narrower than any line: hot pixels, a bad sensor column
-
-    @property
-    def words(self) -> str:
-        """The reason as a summary prints it."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Reason.OK: "found",
-    Reason.WEAK: "too weak",
-    Reason.WIDE: "too wide for the line",
-    Reason.WINDOW: "outside the geometry window",
-    Reason.AMBIGUOUS: "ambiguous",
-    Reason.EDGE: "cut by an edge",
-    Reason.DAMAGED: "image damaged",
-    Reason.BELOW_RANGE: "below range",
-    Reason.BEYOND_RANGE: "beyond range",
-    Reason.OUTLIER: "outlier among its neighbours",
-    Reason.NOT_SCANNED: "not scanned",
-    Reason.NARROW: "too narrow for the line",
-}
-
-
-class LaserLine(NamedTuple):
-    """Laser line of one shot. Arrays of length H, the image's rows; NaN where a row has no line."""
-
-    column_px: Array  # (H,) sub-pixel column, 0 = centre of the first pixel
-    peak: Array  # (H,) height above the background [grey levels]
-    width_px: Array  # (H,) standard deviation of the line's profile
-    sigma_px: Array  # (H,) standard deviation of column_px
-    reason: NDArray[np.uint8]  # (H,) Reason: OK, or why the row has no line
+# A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
+_DIM_PX = 0.8
 
 
 class LaserLineParams(BaseModel, frozen=True, extra="forbid"):
@@ -149,7 +104,7 @@ def find_laser_line(
         channel = channel_of(image, background, params.grey)[0] if image.ndim == 3 else None
         return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
     if not np.isfinite(window).any():
-        return _nothing(len(image), Reason.WINDOW)
+        return no_line(len(image), Reason.WINDOW)
     # Everything below sees only the columns in question.
     left = max(0, int(np.nanmin(window)) - _MARGIN) // 4 * 4
     image = image[:, left : int(np.nanmax(window)) + _MARGIN + 1]
@@ -170,24 +125,24 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
     at = np.flatnonzero(wide), np.rint(line.column_px[wide]).astype(np.intp)
     widest = _CORE_SHARE * line.width_px[wide]
-    line = _lost(line, wide, Reason.WIDE)
+    line = without(line, wide, Reason.WIDE)
     if params.method == "gauss" and at[0].size:
         y, _ = samples_of(sight, *at).of(_CORE_HALF, slice(None))
         _take_cores(line, at, y.T, widest, noise, params)
     if sight.image is not None:
         pure = np.repeat(course.pure, BLOCK)[: len(image)]
-        line = _lost(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
-    line = _lost(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
+        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
+    line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         gain = exposure_gain(sight.on, sight.off)
         height, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, gain)
-        line = _lost(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
+        line = without(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
         # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
         disturbed = with_ripple < _STANDS_OUT[1]
-        line = _lost(line, runs.crumbs(line.column_px, disturbed, _BLOCKS_ROWS), Reason.AMBIGUOUS)
+        line = without(line, runs.crumbs(line.column_px, disturbed, _BLOCKS_ROWS), Reason.AMBIGUOUS)
         weak |= disturbed
-    line = _lost(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
+    line = without(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
     return _pooled(line, params.pool_rows)
 
 
@@ -211,7 +166,7 @@ def _pooled(line: LaserLine, rows: int) -> LaserLine:
 
 def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> LaserLine:
     """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows."""
-    line, noise = _nothing(len(sight.lit), Reason.WEAK), sight.noise
+    line, noise = no_line(len(sight.lit), Reason.WEAK), sight.noise
     row, column = at
     if not row.size:
         return line
@@ -225,6 +180,9 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         contrast = peaks.contrast
         offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
+        dim = (reason == Reason.WEAK) & (peaks.height >= params.min_peak) & (peaks.sigma_px < _DIM_PX)
+        if dim.any():
+            reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, reason == Reason.OK, dim)] = Reason.OK
         if params.method == "gauss":
             # A wide saturated line whose flanks are no Gaussian's stands in a halo.
             misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
@@ -293,14 +251,7 @@ def _within(line: LaserLine, window: Array) -> LaserLine:
     with np.errstate(invalid="ignore"):
         outside = np.isfinite(column) & ~((column >= window[:, 0]) & (column <= window[:, 1]))
     line.reason[np.isnan(window[:, 0])] = Reason.WINDOW
-    return _lost(line, outside, Reason.WINDOW)
-
-
-def _lost(line: LaserLine, mask: NDArray[np.bool_], reason: Reason) -> LaserLine:
-    line.reason[mask] = reason
-    for values in line[:4]:
-        values[mask] = np.nan
-    return line
+    return without(line, outside, Reason.WINDOW)
 
 
 def _brightest(plane: U8, params: LaserLineParams, window: Array) -> LaserLine:
@@ -311,10 +262,5 @@ def _brightest(plane: U8, params: LaserLineParams, window: Array) -> LaserLine:
     # A column between two pixel borders: the standard deviation of a uniform distribution.
     sigma = np.full(len(plane), np.sqrt(1.0 / 12.0))
     line = LaserLine(column.astype(np.float64), value, np.full(len(plane), np.nan), sigma, reason)
-    line = _lost(line, reason == Reason.WEAK, Reason.WEAK)
+    line = without(line, reason == Reason.WEAK, Reason.WEAK)
     return _within(line, window)
-
-
-def _nothing(height: int, reason: Reason) -> LaserLine:
-    column, peak, width, sigma = (np.full(height, np.nan) for _ in range(4))
-    return LaserLine(column, peak, width, sigma, np.full(height, reason, np.uint8))

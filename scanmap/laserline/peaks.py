@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.noise import dot, noise_variance, speckle_contrast
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -24,11 +25,8 @@ _NARROW_PX, _WIDEST = 0.75, 6.2  # the widths, the wider as a part of the window
 _STRAY = 0.01  # share of the rows that is not worth another kind of step
 _DIM = 11.0  # heights, in noise, from whose first guess the way is too long for that
 _ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
-_CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
 _CURVED = 5.0  # how much, measured on dim lines: of (sigma_px / width_px)^2
 _FLANK_SHARE = 0.1  # of what the better flank says of u, at least from the other
-_MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
-_ROWS_POOLED = 32  # rows over which the noise is taken for the same
 SPECKLE_FROM = 0.06  # contrast from which the noise counts as speckle
 
 
@@ -88,7 +86,7 @@ def fit_gaussian(
     if part.size:
         look.weight[:, part] = usable[:, part] * _near(x, fit.of(part), _REACH, least)
     if contrast is None:
-        contrast = _contrast(look.residual, fit.A * look.bell, look.weight, sample_noise)
+        contrast = speckle_contrast(look.residual, fit.A * look.bell, look.weight, sample_noise)
     if contrast > SPECKLE_FROM:
         if samples is not None:
             y, usable = samples(n // 2 + n // 4)
@@ -104,7 +102,7 @@ def _peaks(fit: _Fit, look: _Look, clipped: NDArray[np.bool_], cut: NDArray[np.i
     """What the fits say, and how well; `cut`: the rows some of whose samples say little."""
     # Of a saturated core the fit's height is a guess; that it rises to saturation is known.
     A = np.where(clipped, np.maximum(fit.A, SATURATED - fit.b), fit.A)
-    variance = _noise_variance(look.residual, look.weight)
+    variance = noise_variance(look.residual, look.weight)
     # Cramer-Rao with the other three parameters unknown.
     sigma = np.sqrt(variance / np.maximum(fit.information, np.float32(1e-6))) * fit.s / fit.A
     # A and s are estimates too: what scatters them makes the bound itself too small by their variance.
@@ -114,8 +112,8 @@ def _peaks(fit: _Fit, look: _Look, clipped: NDArray[np.bool_], cut: NDArray[np.i
     odd = np.square(look.z)
     odd -= np.float32(1.5)
     odd *= slope  # orthogonal to the derivative by u over the whole line
-    power = np.maximum(_dot(odd, odd), np.float32(1e-6))
-    asymmetry, uncertain = np.abs(_dot(odd, look.residual)) / power / A, np.sqrt(variance / power) / A
+    power = np.maximum(dot(odd, odd), np.float32(1e-6))
+    asymmetry, uncertain = np.abs(dot(odd, look.residual)) / power / A, np.sqrt(variance / power) / A
     bias = np.float32(0.5) * fit.s * np.maximum(asymmetry - np.float32(0.05) - np.float32(2.5) * uncertain, 0.0)
     one_sided = np.zeros(len(fit.u), bool)
     if cut.size:
@@ -211,9 +209,9 @@ def _improve_whole(x: F32, look: _Look, fit: _Fit) -> _Fit:
     """
     wr = look.weight * look.residual
     per_s = np.float32(1.0) / fit.s
-    level, bell, slope = wr.sum(axis=0) * per_s, _dot(wr, look.bell) * per_s, _dot(wr, look.slope) * per_s
+    level, bell, slope = wr.sum(axis=0) * per_s, dot(wr, look.bell) * per_s, dot(wr, look.slope) * per_s
     wr *= look.slope
-    bent = _dot(wr, look.z) * per_s
+    bent = dot(wr, look.z) * per_s
     count = look.weight.sum(axis=0) * per_s
     # The level eliminated, then height and width; all per sigma.
     k = np.float32(2.0 * np.pi) / count
@@ -248,14 +246,14 @@ def _improve(y: F32, x: F32, weight: F32, fit: _Fit) -> _Fit:
     q = d * z  # derivative by s, times s / A
     wg, wd, wq = weight * g, weight * d, weight * q
     # Normal equations of (b, A, s, u); g q = d d, so that only thirteen sums differ.
-    dd = _dot(wd, d)
+    dd = dot(wd, d)
     normal = (
         (weight.sum(axis=0), wg.sum(axis=0), wq.sum(axis=0), wd.sum(axis=0)),
-        (_dot(wg, g), dd, _dot(wg, d)),
-        (_dot(wq, q), _dot(wq, d)),
+        (dot(wg, g), dd, dot(wg, d)),
+        (dot(wq, q), dot(wq, d)),
         (dd,),
     )
-    right = (_dot(weight, y), _dot(wg, y), _dot(wq, y), _dot(wd, y))
+    right = (dot(weight, y), dot(wg, y), dot(wq, y), dot(wd, y))
     (b, A, t, p), information = _solved(normal, right)
     A = np.maximum(A, 0.5)
     half = len(x) // 2
@@ -313,56 +311,3 @@ def _bell(x: F32, fit: _Fit) -> F32:
     z = (x - fit.u) / fit.s
     bell: F32 = np.exp(np.float32(-0.5) * z * z)
     return bell
-
-
-def _noise_variance(residual: F32, weight: F32) -> F32:
-    """Variance (N,) of a sample of weight 1: the rows' own, its median over neighbouring rows.
-
-    A row far worse than its neighbours (an edge, a second line) keeps its own.
-    """
-    count = (weight > 0).view(np.uint8).sum(axis=0, dtype=np.uint8)
-    freedom = np.maximum(count.astype(np.float32) - np.float32(4.0), np.float32(1.0))
-    own = _dot(weight * residual, residual) / freedom
-    groups = -(-len(own) // _ROWS_POOLED)
-    filled = np.empty(groups * _ROWS_POOLED, np.float32)
-    filled[: len(own)] = own
-    filled[len(own) :] = np.sort(own[-_ROWS_POOLED:])[len(own[-_ROWS_POOLED:]) // 2] if len(own) else 0.0
-    ordered = np.sort(filled.reshape(groups, _ROWS_POOLED), axis=1)
-    # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
-    k = float(freedom.mean()) if len(own) else 1.0
-    middle = ordered[:, _ROWS_POOLED // 2 - 1] + ordered[:, _ROWS_POOLED // 2]
-    common = np.repeat(middle * np.float32(0.5 / (1.0 - 2.0 / (9.0 * k)) ** 3), _ROWS_POOLED)[: len(own)]
-    limit = np.float32(1.0) + np.sqrt(np.float32(32.0) / freedom)
-    variance: F32 = np.maximum(np.where(own > limit * common, own, common), np.float32(1.0 / 12.0))
-    return variance
-
-
-def _contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> float:
-    """Speckle contrast: how much the scatter between neighbouring rows grows with the signal.
-
-    Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
-    """
-    quick = slice(None, None, max(1, residual.shape[1] // 128))
-    weights, left = weight[:, quick], residual[:, quick]
-    own = np.sort(_dot(weights * left, left) / np.maximum(weights.sum(axis=0) - 4.0, 1.0))
-    if not len(own) or own[len(own) // 2] < _MORE_SCATTER * sample_noise**2:
-        return 0.0
-    stride = max(1, residual.shape[1] // 300)
-    pairs = [(values[:, 1::stride], values[:, :-1:stride]) for values in (residual, signal, weight)]
-    step = pairs[0][0] - pairs[0][1]
-    level = np.minimum(*pairs[1])
-    core = (level > 0.4 * level.max(axis=0, initial=0.0)) * (pairs[2][0] * pairs[2][1])
-    count = core.sum(axis=0)
-    usable = count >= 2
-    if usable.sum() < 20:
-        return 0.0
-    scatter = 0.5 * _dot(core * step, step)[usable] / count[usable]
-    power = _dot(core * level, level)[usable] / count[usable]
-    # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
-    excess = (scatter / _CORE_KEEPS - 1.5 * sample_noise**2) / power
-    return float(np.sqrt(max(float(np.median(excess)) / 0.8, 0.0)))
-
-
-def _dot(a: F32, b: F32) -> F32:
-    product: F32 = np.einsum("ij,ij->j", a, b)
-    return product

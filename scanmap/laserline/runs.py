@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+F32 = NDArray[np.float32]
+Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 NO_BLOB_PX = 2.3  # what is no wider, as sigma, can be a line at any resolution
@@ -13,7 +15,28 @@ _NEAR = 140.0  # [grey levels] what is brighter can be a near line, wide by its 
 _CERTAIN, _BRIGHT = 0.06, 40.0  # sigma_px over width_px, and peak, of a row that is surely a line
 _UNEVEN_PX, _UNEVEN_HEIGHT = 3.0, 14.0
 _INNER = 8  # rows of a run long enough to have ends and an inside
+_NEAR_ROWS = 6  # between the rows found above and below one that is too dim alone
 _GAP_ROWS = 2  # missing rows that do not end a run
+
+
+def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask) -> Index:
+    """Which of N rows are too dim alone but lie where the rows found above and below say that the line is.
+
+    Args:
+        row: (N,) rising.
+        column, sigma: (N,) [px].
+        good, dim: (N,) rows found, and rows in question.
+    """
+    found, asked = np.flatnonzero(good), np.flatnonzero(dim)
+    after = np.searchsorted(found, asked)
+    inside = (after > 0) & (after < len(found))
+    asked, before, after = asked[inside], found[after[inside] - 1], found[np.minimum(after[inside], len(found) - 1)]
+    span = row[after] - row[before]
+    share = (row[asked] - row[before]) / np.maximum(span, 1)
+    off = column[asked] - (column[before] + share * (column[after] - column[before]))
+    spread = np.sqrt(sigma[asked] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[after] ** 2))
+    near = (span <= _NEAR_ROWS) & (np.abs(column[after] - column[before]) < 3.0 + span) & (np.abs(off) < 3.0 * spread)
+    return np.asarray(asked[near], np.intp)
 
 
 def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) -> Mask:

@@ -1,0 +1,73 @@
+"""What finding the laser line gives: `LaserLine`, and the `Reason` of every row without one."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Reason(IntEnum):
+    """Why a row has no point. One list from image to range image, so that a summary can add them up."""
+
+    OK = 0
+    WEAK = 1  # no peak above the noise
+    WIDE = 2  # too wide to be the laser line: lamp, window, halo
+    WINDOW = 3  # only outside the columns that geometry allows
+    AMBIGUOUS = 4  # several candidates, none clearly the line
+    EDGE = 5  # cut by the image border or by a depth edge too close to correct
+    DAMAGED = 6  # the image has no data here
+    BELOW_RANGE = 7  # nearer than the model or range_min allows
+    BEYOND_RANGE = 8  # farther than range_max, or at infinity
+    OUTLIER = 9  # removed by the filter over neighbours in the range image
+    NOT_SCANNED = 10  # no shot covers this cell
+    NARROW = 11  # narrower than any line: hot pixels, a bad sensor column
+
+    @property
+    def words(self) -> str:
+        """The reason as a summary prints it."""
+        return _WORDS[self]
+
+
+_WORDS = {
+    Reason.OK: "found",
+    Reason.WEAK: "too weak",
+    Reason.WIDE: "too wide for the line",
+    Reason.WINDOW: "outside the geometry window",
+    Reason.AMBIGUOUS: "ambiguous",
+    Reason.EDGE: "cut by an edge",
+    Reason.DAMAGED: "image damaged",
+    Reason.BELOW_RANGE: "below range",
+    Reason.BEYOND_RANGE: "beyond range",
+    Reason.OUTLIER: "outlier among its neighbours",
+    Reason.NOT_SCANNED: "not scanned",
+    Reason.NARROW: "too narrow for the line",
+}
+
+
+class LaserLine(NamedTuple):
+    """Laser line of one shot. Arrays of length H, the image's rows; NaN where a row has no line."""
+
+    column_px: Array  # (H,) sub-pixel column, 0 = centre of the first pixel
+    peak: Array  # (H,) height above the background [grey levels]
+    width_px: Array  # (H,) standard deviation of the line's profile
+    sigma_px: Array  # (H,) standard deviation of column_px
+    reason: NDArray[np.uint8]  # (H,) Reason: OK, or why the row has no line
+
+
+def no_line(height: int, reason: Reason) -> LaserLine:
+    """A line of `height` rows that has none."""
+    column, peak, width, sigma = (np.full(height, np.nan) for _ in range(4))
+    return LaserLine(column, peak, width, sigma, np.full(height, reason, np.uint8))
+
+
+def without(line: LaserLine, mask: NDArray[np.bool_], reason: Reason) -> LaserLine:
+    """The line, changed in place, without the rows of `mask` (H,)."""
+    line.reason[mask] = reason
+    for values in line[:4]:
+        values[mask] = np.nan
+    return line
