@@ -19,6 +19,7 @@ from scanmap.errors import CameraError, ConfigError
 from scanmap.rig import Camera, Streaming
 from scanmap.rig import camera as camera_module
 from scanmap.rig.camera import CameraParams, open_camera
+from scanmap.rig.camera_capture import CapturedPictures
 from scanmap.rig.camera_checks import fingerprint, size_of, without_padding
 from scanmap.rig.camera_stream import BLACK_SHOTS, StreamCamera
 from scanmap.shot import decode_image, encode_png, image_format
@@ -392,6 +393,24 @@ def test_an_unplugged_camera_is_noticed_in_time_and_comes_back(device: FakeDevic
         assert device.opened >= 2
         camera.grab()
     assert device.released >= device.opened
+
+
+def test_a_camera_plugged_in_anew_is_found_by_its_own_name(
+    device: FakeDevice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may come back as another number; the link named after it leads there."""
+    (tmp_path / "usb-Cam_123-video-index0").symlink_to("/dev/video3")
+    (tmp_path / "usb-Other-video-index0").symlink_to("/dev/video0")
+    monkeypatch.setattr("scanmap.rig.camera_capture.BY_ID", tmp_path)
+    asked: list[object] = []
+    fake = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda target, *rest: asked.append(target) or fake(3, *rest))
+    source = CapturedPictures(CameraParams(source=3, exposure_us=1000))
+    source.open()
+    source.close()
+    source.open()
+    source.close()
+    assert asked == [3, str(tmp_path / "usb-Cam_123-video-index0")]
 
 
 def test_a_phone_that_hangs_up_is_asked_again(frames: Callable[[], bytes], caplog: pytest.LogCaptureFixture) -> None:

@@ -25,7 +25,7 @@ from scanmap.laserline import Reason
 from scanmap.rig import camera as camera_module
 from scanmap.rig.camera_probe import probe_modes
 from scanmap.session import doctor as doctor_module
-from scanmap.session.live import Knobs
+from scanmap.session.knobs import Knobs
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import plug, pty_port
 

@@ -12,7 +12,8 @@ import typer
 from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
 
 if TYPE_CHECKING:
-    from scanmap.session.live import Distance, Knobs, Reading
+    from scanmap.session.knobs import Knobs
+    from scanmap.session.live import Distance, Reading
 
 LINE_EVERY_S = 1.0  # where nobody watches a terminal
 NAMES = {"ratio": "Algorithm 1", "pixel_angle": "Algorithm 2", "plane": "calibrated"}

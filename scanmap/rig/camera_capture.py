@@ -9,6 +9,7 @@ import logging
 import math
 import sys
 import time
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,6 +21,7 @@ from scanmap.rig.camera_checks import without_padding
 from scanmap.rig.camera_stream import Picture
 
 BACKENDS = {"linux": cv2.CAP_V4L2, "win32": cv2.CAP_DSHOW, "darwin": cv2.CAP_AVFOUNDATION}
+BY_ID = Path("/dev/v4l/by-id")
 MAX_AGE_S = 1.0  # a device's stamp further back than this is none
 PATIENCE_MS = 5000  # of OpenCV with a network stream
 # (manual, automatic) exposure as the system's interface numbers them.
@@ -46,6 +48,7 @@ class CapturedPictures:
         self._capture: Any = None
         self._device_stamps: bool | None = None  # whether the device stamps its pictures; known after the first
         self._known_refusals: list[str] = []
+        self._lasting = ""  # finds the same camera again when it is plugged in anew and gets another number
 
     @property
     def name(self) -> str:
@@ -70,6 +73,7 @@ class CapturedPictures:
                     logger.warning("camera %s: %s", self.name, refusal)
             self._known_refusals = refusals
         self._capture = capture
+        self._lasting = self._lasting or _lasting_name(self.name)
 
     def read(self) -> Picture:
         """The next picture.
@@ -106,8 +110,8 @@ class CapturedPictures:
         if self._params.kind == "stream":
             patience = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, PATIENCE_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, PATIENCE_MS]
             return cv2.VideoCapture(self.name, cv2.CAP_FFMPEG, patience)
-        target = int(self.name) if self.name.isdigit() else self.name
-        return cv2.VideoCapture(target, BACKENDS.get(sys.platform, cv2.CAP_ANY))
+        target = self._lasting or self.name
+        return cv2.VideoCapture(int(target) if target.isdigit() else target, BACKENDS.get(sys.platform, cv2.CAP_ANY))
 
     def _stamp(self, arrival: float) -> float:
         """The driver's own stamp, which is nearer to the exposure, where it is on our clock; else the arrival."""
@@ -135,6 +139,14 @@ class CapturedPictures:
             f"camera {self.name} cannot be opened; cameras of this machine: {found}. Another program may hold it, or "
             "you may not use it (group `video`: `sudo usermod -aG video $USER`); `scanmap doctor` looks closer"
         )
+
+
+def _lasting_name(source: str) -> str:
+    """The device file, of those named after the camera itself, that leads to `source`; empty where there is none."""
+    if sys.platform != "linux" or not BY_ID.is_dir():
+        return ""
+    device = Path("/dev") / f"video{source}" if source.isdigit() else Path(source)
+    return next((str(link) for link in sorted(BY_ID.iterdir()) if link.resolve() == device.resolve()), "")
 
 
 def _as_sent(pixels: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes | np.ndarray[Any, np.dtype[np.uint8]]:

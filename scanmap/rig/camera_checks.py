@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import zlib
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from scanmap.errors import CameraError
@@ -16,8 +14,6 @@ from scanmap.shot import JPEG_END, decode_image, image_format
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN = 0xDA
 BLACK_DN = 3  # [grey levels] a picture whose brightest pixel is no brighter shows nothing at all
-
-logger = logging.getLogger(__name__)
 
 
 class Size(NamedTuple):
@@ -82,14 +78,6 @@ def is_black(data: bytes) -> bool:
     if decoded.rows_valid < len(decoded.image):
         raise CameraError(f"camera sent a damaged picture: {decoded.rows_valid} of {len(decoded.image)} rows are whole")
     return int(np.max(decoded.image)) <= BLACK_DN
-
-
-def thumbnail_mean(data: bytes) -> float:
-    """Mean grey level of a picture, from an eighth of its resolution."""
-    small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    if small is None:
-        raise CameraError(f"image of {len(data)} bytes cannot be decoded")
-    return float(np.mean(small))
 
 
 def _segments(data: bytes) -> list[tuple[int, int]]:

@@ -12,8 +12,8 @@ from scanmap.session.inspection import (
     watch,
 )
 from scanmap.session.job import Job, Progress, Result
+from scanmap.session.knobs import HELP as KEYS_HELP
 from scanmap.session.latency import measure_latency
-from scanmap.session.live import HELP as KEYS_HELP
 from scanmap.session.live import open_live
 from scanmap.session.live_view import open_live_view, watching_words
 from scanmap.session.new_rig import Drive, Head, first_config

@@ -7,9 +7,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,63 +17,21 @@ from scanmap.calibration import Calibration
 from scanmap.config import Config
 from scanmap.errors import CalibrationError, CameraError, ConfigError, StageError
 from scanmap.laserline import Reason, to_grey
-from scanmap.laserline.grey import Grey
 from scanmap.pipeline import Pipeline, Step
 from scanmap.recording import open_source
 from scanmap.rig import Camera, Frame, Streaming
 from scanmap.rig.camera import open_camera
 from scanmap.rig.camera_files import NoMorePicturesError
+from scanmap.session.knobs import MODELS, Knobs
 from scanmap.session.preparing import Choice, prepare_replay
 from scanmap.session.rigs import TWIN_NAME, open_twin, opened_stage
 from scanmap.shot import Shot, decode_image
 from scanmap.triangulation import TriangulationParams, locate, pixel_ratio
 
-MODELS = ("plane", "ratio", "pixel_angle")
-COLOURS = ("red", "green", "blue")
-GREYS: tuple[Grey, ...] = get_args(Grey)
 TIMED_FRAMES = 20
 PATIENT_FRAMES = 5  # so many faults in a row end it
 
-Model = Literal["plane", "ratio", "pixel_angle"]
-Colour = Literal["red", "green", "blue"]
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """What can be changed while it runs."""
-
-    grey: Grey
-    bit_index: int
-    row: int
-    colour: Colour
-    model: Model
-    ended: bool = False
-
-    def pressed(self, key: str, rows: int) -> Knobs:
-        """What a key makes of it; keys without a meaning change nothing.
-
-        Args:
-            key: a character, or `up`, `down`.
-            rows: height of the image.
-        """
-        if key in ("+", "-"):
-            step = 1 if key == "+" else -1
-            return replace(self, grey="bit_index", bit_index=min(24, max(0, self.bit_index + step)))
-        if key in ("up", "k", "down", "j", "K", "J"):
-            step = {"up": -1, "k": -1, "down": 1, "j": 1, "K": -10, "J": 10}[key]
-            return replace(self, row=min(rows - 1, max(0, self.row + step)))
-        if key in ("g", "G"):
-            at = GREYS.index(self.grey) + (1 if key == "g" else -1)
-            return replace(self, grey=GREYS[at % len(GREYS)])
-        if key == "c":
-            return replace(self, colour=_after(COLOURS, self.colour))
-        if key == "m":
-            return replace(self, model=_after(MODELS, self.model))
-        return replace(self, ended=True) if key == "q" else self
-
-
-HELP = "+ - bit index, g grey, up down (J K: ten) row, c colour, m model, q or Ctrl-C end"
 
 
 class Distance(NamedTuple):
@@ -304,7 +262,3 @@ def _paced(shots: Iterator[Shot]) -> Iterator[Shot]:
 
 def _rate(times: deque[float]) -> float:
     return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
-
-
-def _after(choices: tuple[str, ...], one: str) -> Any:
-    return choices[(choices.index(one) + 1) % len(choices)]

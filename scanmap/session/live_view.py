@@ -6,7 +6,8 @@ from pathlib import Path
 
 from scanmap.errors import ConfigError
 from scanmap.pipeline import Step
-from scanmap.session.live import Knobs, Live
+from scanmap.session.knobs import Knobs
+from scanmap.session.live import Live
 from scanmap.view import View, open_view, show
 from scanmap.view.viewer import has_display
 
