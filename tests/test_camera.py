@@ -219,6 +219,21 @@ def test_http_bytes_are_kept_with_and_without_a_length(frames: Callable[[], byte
             assert camera.grab().image in sent
 
 
+def test_a_thumbnail_inside_a_picture_is_not_its_end(frames: Callable[[], bytes]) -> None:
+    thumbnail = as_jpeg(np.zeros((16, 16, 3), np.uint8))
+
+    def send() -> bytes:
+        data = frames()
+        return data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
+
+    with (
+        phone(send, with_length=False) as served,
+        opened(CameraParams(source=served.url + "/video", latency_s=0.0)) as camera,
+    ):
+        assert (camera.width, camera.height) == (64, 48)
+        assert decode_image(camera.grab().image).rows_valid == 48
+
+
 # Settings
 
 

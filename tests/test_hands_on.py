@@ -128,6 +128,21 @@ def test_home_by_switch_really_homes() -> None:
     assert "home, by its switch: bearing -2.000 deg" in said
 
 
+def test_asking_where_and_the_laser_move_nothing_even_where_opening_would_home() -> None:
+    board = Firmware(switch_deg=-3.0)
+    board.memory.settings.update({22: 1, 23: 1})
+    board.drivetrain.bearing_deg = 30.0
+    with plug(board) as url:
+        config = configuration.load(
+            "twin-room", ["rig=hardware", f"stage.port={url}", "stage.homing=switch", "stage.home_deg=-2"]
+        )
+        session.where(config, lambda _: None)
+        session.switch_laser(config, lambda _: None, on=True, seconds=0.1)
+        assert math.degrees(board.bearing) == pytest.approx(30.0)
+        session.home(config, lambda _: None)
+        assert math.degrees(board.bearing) < 0.0
+
+
 @pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
 def test_the_laser_is_on_only_while_the_command_runs(head: Head, attached: str) -> None:
     config = configuration.load("twin-room", [*HARDWARE, f"stage.port={attached}"])

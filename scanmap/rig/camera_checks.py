@@ -12,7 +12,7 @@ from scanmap.shot import JPEG_END, decode_image, image_format
 
 # Every frame header of JPEG; the other numbers between them are tables.
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_SCAN = 0xDA
+START_OF_SCAN = 0xDA
 BLACK_DN = 3  # [grey levels] a picture whose brightest pixel is no brighter shows nothing at all
 
 
@@ -40,7 +40,7 @@ def size_of(data: bytes) -> Size:
     """
     if image_format(data) == "png" and len(data) >= 24:
         return Size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
-    for marker, at in _segments(data):
+    for marker, at in segments(data):
         if marker in _FRAME_HEADERS and at + 9 <= len(data):
             return Size(int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big"))
     raise CameraError(f"camera sent {len(data)} bytes that are no JPEG or PNG")
@@ -48,8 +48,8 @@ def size_of(data: bytes) -> Size:
 
 def fingerprint(data: bytes) -> int:
     """The same for two JPEGs that decode alike, whatever their time stamps and comments say."""
-    for marker, at in _segments(data):
-        if marker == _SCAN:
+    for marker, at in segments(data):
+        if marker == START_OF_SCAN:
             return zlib.crc32(data[at:])
     return zlib.crc32(data)
 
@@ -80,7 +80,7 @@ def is_black(data: bytes) -> bool:
     return int(np.max(decoded.image)) <= BLACK_DN
 
 
-def _segments(data: bytes) -> list[tuple[int, int]]:
+def segments(data: bytes) -> list[tuple[int, int]]:
     """Marker and position of a JPEG's segments up to its first scan."""
     found: list[tuple[int, int]] = []
     at = 2
@@ -90,7 +90,7 @@ def _segments(data: bytes) -> list[tuple[int, int]]:
             at += 1
             continue
         found.append((marker, at))
-        if marker == _SCAN:
+        if marker == START_OF_SCAN:
             break
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return found

@@ -17,11 +17,12 @@ from typing import Any
 
 from scanmap.errors import CameraError
 from scanmap.rig.camera import CameraParams
-from scanmap.rig.camera_checks import without_padding
+from scanmap.rig.camera_checks import START_OF_SCAN, segments, without_padding
 from scanmap.rig.camera_stream import Picture
 from scanmap.shot import JPEG_END, JPEG_MAGIC
 
 MAX_PICTURE_BYTES = 64_000_000
+MAX_TABLES_BYTES = 1 << 20
 MAX_HEADER_LINES = 64
 CHUNK_BYTES = 16384
 SNAPSHOTS_HZ = 10.0  # how often a single-picture URL is asked where no rate is set
@@ -149,9 +150,14 @@ class HttpPictures:
         return data
 
     def _until_end(self) -> bytes:
-        searched = 0
-        while (end := self._buffer.find(JPEG_END, max(0, searched - 1))) < 0:
-            searched = len(self._buffer)
+        # Only behind its tables: a thumbnail among them has an end of its own.
+        while not (found := segments(bytes(self._buffer[:MAX_TABLES_BYTES]))) or found[-1][0] != START_OF_SCAN:
+            if len(self._buffer) > MAX_TABLES_BYTES:
+                raise ValueError("a picture without a beginning")
+            self._receive()
+        searched = found[-1][1]
+        while (end := self._buffer.find(JPEG_END, searched)) < 0:
+            searched = len(self._buffer) - 1
             if searched > MAX_PICTURE_BYTES:
                 raise ValueError("a picture that does not end")
             self._receive()
