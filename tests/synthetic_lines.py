@@ -242,6 +242,25 @@ def _red_ribs(room: Room) -> None:
         room.ambient[int(0.2 * room.height) : int(0.8 * room.height), int(x) : int(x) + 5] = (20.0, 22.0, 95.0)
 
 
+def _spines(room: Room) -> None:
+    """A shelf of books, spines as red and as high as the line, some columns wide; what is behind swallows the line."""
+    top, bottom = int(0.35 * room.height), int(0.6 * room.height)
+    room.ambient[top:bottom] = (12.0, 12.0, 14.0)
+    for x in np.linspace(0.1, 0.9, 12) * room.width:
+        wide = int(room.rng.integers(7, 14))
+        if np.nanmin(np.abs(room.column - x - wide / 2)) > 25:
+            room.ambient[top:bottom, int(x) : int(x) + wide] = (18.0, 20.0, 150.0)
+    room.peak[top:bottom] = 1.0
+    row = np.arange(room.height)
+    room.hide((row >= top - 2) & (row < bottom + 2))
+
+
+def _tube(room: Room) -> None:
+    """A tube of light, upright, saturated and no wider than a near line."""
+    left = int(0.7 * room.width)
+    room.ambient[int(0.1 * room.height) : int(0.75 * room.height), left : left + 5] = (900.0, 950.0, 950.0)
+
+
 def _posters(room: Room) -> None:
     for _ in range(18):
         x, y, w, h = room.rng.uniform([0, 0, 0.04, 0.04], [0.9, 0.9, 0.25, 0.3])
@@ -357,6 +376,8 @@ HARD: dict[str, Callable[[Room], None]] = {
     "small lamps": _lamps_small,
     "stripes": _stripes,
     "red ribs": _red_ribs,
+    "red spines": _spines,
+    "tube of light": _tube,
     "posters": _posters,
     "white text": _text,
     "monitor": _monitor,

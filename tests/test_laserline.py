@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from line_pairs import PIECES, marked, pair
 from synthetic_lines import GREEN, HARD, RED, LineSpec, bound, clean, hard_frame, line_light, score, sensor
 
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
+from scanmap.laserline.channel import laser_channel
 
 GAUSS = LaserLineParams()
 POOLED = LaserLineParams(pool_rows=9)
@@ -269,6 +271,8 @@ def test_a_window_of_nothing_gives_nothing():
 BEYOND = {
     ("white text", True, False),
     ("white text", False, False),
+    # Without colour and without an off frame a tube is a line; which of the two moves only the next bearing tells.
+    ("tube of light", False, False),
 }
 ROOMS = [
     (name, colour, off)
@@ -330,6 +334,23 @@ def photographs_found(data, folder, pattern, step, reference, rows=slice(None)):
         clear, hit, astray = clear + good.sum(), hit + (good & (off < 6)).sum(), astray + (good & (off >= 6)).sum()
     assert clear > 100 * len(files)
     return hit / clear, astray / clear
+
+
+@pytest.mark.parametrize("number", sorted(PIECES))
+def test_a_line_of_one_or_two_pixels_is_found_with_an_off_frame(data, number):
+    """Sharpened and compressed pictures 240 columns wide; exposure changes, lamp, black and glossy things."""
+    on, off = pair(data / "real" / "laser-range-finder" / "images", number)
+    row = marked(number)
+    column = find_laser_line(on, GAUSS, off).column_px
+    near, carries = np.abs(column - row) <= 4.0, np.isfinite(row)
+    assert near[carries].mean() >= (0.94 if number == 10 else 0.95)
+    assert np.mean(np.isfinite(column[carries]) & ~near[carries]) <= 0.005
+
+
+def test_the_lasers_channel_is_told_on_a_white_board_in_a_bright_room(data):
+    files = sorted((data / "real" / "srv-calib" / "laser").glob("*.jpg"))[::4]
+    channels = [laser_channel(np.asarray(cv2.imread(str(file)), np.uint8)) for file in files]
+    assert np.mean(np.array(channels) == 1) >= 0.9
 
 
 def test_a_thin_line_on_white_plaster_in_a_bright_room(data):

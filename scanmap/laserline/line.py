@@ -15,6 +15,7 @@ from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
+from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
@@ -132,6 +133,8 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     if sight.image is not None:
         pure = np.repeat(course.pure, BLOCK)[: len(image)]
         line = without(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
+    if sight.off is None and params.method == "gauss":
+        line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane), Reason.WIDE)
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:

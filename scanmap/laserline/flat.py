@@ -1,0 +1,66 @@
+"""What is as bright across as a painted strip: spines of books, stripes of cloth, legs of furniture."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline.channel import SATURATED
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+_WIDE_PX = 1.6  # narrower profiles are blurred too much to have a flat top
+_AT = 0.8  # standard deviations from the middle where a profile is asked; a Gaussian has 0.73 of its height there
+_FLAT = 0.88  # of the height there from which on the top is flat
+_NEARBY = 10  # rows of a run on either side of one that are asked with it
+_LEAST_ROWS = 4
+_SURE = 2.0  # standard errors of its mean that a stretch's flatness must exceed
+
+
+def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
+    """Rows (H,) in stretches whose profile is flat on top, as no unsaturated beam's is.
+
+    Args:
+        column, width, peak: (H,) of the line, NaN where none.
+        plane: (H, W) it was found in.
+
+    One row's samples scatter too much to say so; the mean of a stretch does not. Both sides are asked, and the higher
+    background counts for each, so that a line on a step of brightness is not taken for a strip.
+    """
+    flat = np.zeros(len(column), bool)
+    with np.errstate(invalid="ignore"):
+        row = np.flatnonzero((width > _WIDE_PX) & (peak < SATURATED))
+    if len(row) < _LEAST_ROWS:
+        return flat
+    run = np.concatenate([[0], np.cumsum((np.diff(row) > 2) | (np.abs(np.diff(column[row])) > 3.0))])
+    long = (np.bincount(run) >= _LEAST_ROWS)[run]
+    row, run = row[long], run[long]
+    if not row.size:
+        return flat
+    middle, left, right = (_sampled(plane, row, column[row] + k * _AT * width[row]) for k in (0.0, -1.0, 1.0))
+    below = [_sampled(plane, row, column[row] + k * 3.0 * width[row]) for k in (-1.0, 1.0)]
+    shoulder, top = np.minimum(left - below[0], right - below[1]), middle - np.maximum(*below)
+    clipped = middle >= SATURATED
+    excess = shoulder - _FLAT * top
+    total = np.zeros((5, len(row) + 1))
+    np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
+    index = np.arange(len(row))
+    first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
+    stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
+    rows = stop - first
+    mean, square, top, usual, clipped = (total[:, stop] - total[:, first]) / rows
+    scatter = np.sqrt(np.maximum(square - mean * mean, 0.0) / rows)
+    flat[row] = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1)
+    return flat
+
+
+def _sampled(plane: U8, row: Index, column: F64) -> F64:
+    """Values (N,) at columns between samples, interpolated."""
+    x = np.clip(column, 0.0, plane.shape[1] - 1.001)
+    left = x.astype(np.intp)
+    part = x - left
+    value: F64 = plane[row, left] * (1.0 - part) + plane[row, left + 1] * part
+    return value
