@@ -75,8 +75,8 @@ def _rise(own: U8, others: NDArray[np.generic], white: U8) -> U8:
     width = own.shape[1]
     rise = _lesser(own, lead, white, max(_NARROW_PX[0], width // _NARROW_PX[1]), 5)
     clipped = np.asarray(cv2.threshold(own, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
-    if clipped.any():
-        # A saturated core may be wider than that.
+    if np.asarray(cv2.erode(clipped, np.ones((1, 3), np.uint8))).any():
+        # A saturated core of some width may be wider than that.
         away = max(_BRIGHT_PX[0], width // _BRIGHT_PX[1])
         wide = cv2.min(_lesser(own, lead, white, away, 2 * away + 1), clipped)
         rise = np.asarray(cv2.max(rise, wide), np.uint8)
