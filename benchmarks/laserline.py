@@ -36,6 +36,7 @@ class Case:
     spec: LineSpec
     pool_rows: int = 0
     window: bool = False
+    jpeg: tuple[int, str] | None = None  # quality and colour resolution that the frame goes through
     limit_px: float | None = None
     limit_ms: float | None = None
 
@@ -74,6 +75,18 @@ CASES = {
     "sigma 4, peak 100, noise 6": Case(replace(PLAIN, sigma=4.0, peak=100.0, noise=6.0)),
     "sigma 1, saturated": Case(replace(PLAIN, sigma=1.0, peak=510.0)),
     "sigma 4, saturated, noise 6": Case(replace(PLAIN, sigma=4.0, peak=400.0, noise=6.0)),
+}
+CASES |= {
+    f"JPEG {quality} {sampling}, {name}{', pooled' if rows else ''}": Case(
+        replace(PLAIN, colour=colour), pool_rows=rows, jpeg=(quality, sampling)
+    )
+    for quality, sampling, name, colour in (
+        (85, "422", "grey", None),
+        (85, "422", "BGR", RED),
+        (85, "420", "BGR", RED),
+        (95, "422", "BGR", RED),
+    )
+    for rows in (0, 9)
 }
 TEXTBOOK_CASES = ("default", "peak 40", "saturated, peak 510", "speckle 0.3", "steps of 60 px")
 
@@ -135,6 +148,13 @@ TEXTBOOK: dict[str, Callable[[U8], F64]] = {
 }
 
 
+def compressed(image: U8, quality: int, sampling: str) -> U8:
+    """The frame after JPEG."""
+    factor = {"422": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422, "420": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420}[sampling]
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor]
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, how)[1], cv2.IMREAD_UNCHANGED), np.uint8)
+
+
 def cpu_ms(call: Callable[[], object], repeats: int = 5) -> float:
     """CPU time of the fastest call [ms]; the first, which finds cold caches, does not count."""
     call()
@@ -153,6 +173,7 @@ def measure(name: str, case: Case, seeds: int, textbook: bool) -> None:
     others_ms: dict[str, list[float]] = {other: [] for other in TEXTBOOK}
     for seed in range(seeds):
         image, truth = clean(case.spec, np.random.default_rng(seed))
+        image = image if case.jpeg is None else compressed(image, *case.jpeg)
         line = find_laser_line(image, case.params, window=case.window_px)
         times.append(cpu_ms(lambda image=image: find_laser_line(image, case.params, window=case.window_px)))
         errors.append(line.column_px - truth)

@@ -1,6 +1,6 @@
 """ms per frame of every part, and replay against decoding alone, in one run.
 
-    python benchmarks/pipeline.py [--frames 300] [--colour]
+    python benchmarks/pipeline.py [--frames 300] [--red-filter]
 
 The frames are 1600x1200 JPEGs of about 285 kB: a curved line of sigma 2 px over a noisy, textured background.
 """
@@ -32,8 +32,8 @@ WIDTH, HEIGHT = 1600, 1200
 DISTINCT = 24
 
 
-def frames() -> list[bytes]:
-    """Distinct JPEGs of a line that wanders between 2 and 5 m."""
+def frames(red_filter: bool = False) -> list[bytes]:
+    """Distinct JPEGs of a line that wanders between 2 and 5 m; grey ones as behind a red filter."""
     rng = np.random.default_rng(1)
     rows, columns = np.arange(HEIGHT)[:, None], np.arange(WIDTH)[None, :]
     texture = cv2.GaussianBlur(rng.normal(0, 60, (HEIGHT, WIDTH, 3)).astype(np.float32), (0, 0), 3)
@@ -43,7 +43,7 @@ def frames() -> list[bytes]:
         line = 190 * np.exp(-0.5 * ((columns - centre) / 2.0) ** 2)
         image = 25 + texture + rng.normal(0, 3, (HEIGHT, WIDTH, 3))
         image += line[..., None] * np.array([0.1, 0.15, 1.0])
-        pixels = np.clip(image, 0, 255).astype(np.uint8)
+        pixels = np.clip(image[..., 2] if red_filter else image, 0, 255).astype(np.uint8)
         made.append(bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]))
     return made
 
@@ -70,10 +70,10 @@ def main() -> None:
     parser.add_argument("--red-filter", action="store_true", help="a camera behind a red filter: grey decode")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    settings = ['laserline.grey="mean"'] if options.red_filter else []
+    settings = ['laserline.grey="luminance_601"'] if options.red_filter else []
     config = load("twin-room", settings)
     head = config.head()
-    jpegs = frames()
+    jpegs = frames(options.red_filter)
     pipeline = Pipeline(head, config.laserline, config.triangulation)
     grey = not pipeline.colour
     print(f"{os.cpu_count()} cores, {DISTINCT} distinct JPEGs of {np.mean([len(j) for j in jpegs]) / 1e3:.0f} kB")

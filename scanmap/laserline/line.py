@@ -194,10 +194,11 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
             lost = (reason != Reason.OK) & ~final
             _take_cores(line, (r[lost], c[lost]), y.T[lost], params.max_width_px, noise, params)
         good = reason == Reason.OK
-        at_good = r[good]
-        line.column_px[at_good], line.peak[at_good] = (c + offset)[good], peaks.height[good]
-        line.width_px[at_good] = peaks.width_px[good]
-        line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px, peaks.bias_px)[good], _SIGMA_LEAST_PX)
+        k = np.flatnonzero(good)
+        at_good = r[k]
+        line.column_px[at_good], line.peak[at_good] = c[k] + offset[k], peaks.height[k]
+        line.width_px[at_good] = peaks.width_px[k]
+        line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px[k], peaks.bias_px[k]), _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]
