@@ -17,6 +17,7 @@ _AT = 0.8  # standard deviations from the middle where a profile is asked; a Gau
 _FLAT = 0.88  # of the height there from which on the top is flat
 _NEARBY = 10  # rows of a run on either side of one that are asked with it
 _LEAST_ROWS = 4
+_ENOUGH_ROWS = 300
 _SURE = 2.0  # standard errors of its mean that a stretch's flatness must exceed
 
 
@@ -36,10 +37,10 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
     if len(row) < _LEAST_ROWS:
         return flat
     run = np.concatenate([[0], np.cumsum((np.diff(row) > 2) | (np.abs(np.diff(column[row])) > 3.0))])
-    long = (np.bincount(run) >= _LEAST_ROWS)[run]
-    row, run = row[long], run[long]
-    if not row.size:
-        return flat
+    # Of many rows some tell of all.
+    step = 1 + len(row) // _ENOUGH_ROWS
+    every, by_run = row, run
+    row, run = row[::step], run[::step]
     middle, left, right = (_sampled(plane, row, column[row] + k * _AT * width[row]) for k in (0.0, -1.0, 1.0))
     below = [_sampled(plane, row, column[row] + k * 3.0 * width[row]) for k in (-1.0, 1.0)]
     shoulder, top = np.minimum(left - below[0], right - below[1]), middle - np.maximum(*below)
@@ -47,13 +48,16 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
     excess = shoulder - _FLAT * top
     total = np.zeros((5, len(row) + 1))
     np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
-    index = np.arange(len(row))
-    first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
-    stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
+    index, reach = np.arange(len(row)), max(2, _NEARBY // step)
+    first = np.maximum(index - reach, np.searchsorted(run, run))
+    stop = np.minimum(index + reach + 1, np.searchsorted(run, run, side="right"))
     rows = stop - first
     mean, square, top, usual, clipped = (total[:, stop] - total[:, first]) / rows
     scatter = np.sqrt(np.maximum(square - mean * mean, 0.0) / rows)
-    flat[row] = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1)
+    sure = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1) & (rows * step >= _LEAST_ROWS)
+    # A row is what the asked ones of its run before and after it are.
+    for ask in (np.arange(len(every)) // step, np.minimum(np.arange(len(every)) // step + 1, len(row) - 1)):
+        flat[every] |= sure[ask] & (run[ask] == by_run)
     return flat
 
 
