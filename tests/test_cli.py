@@ -117,10 +117,14 @@ def test_every_command_has_help_of_80_columns(run: Run, command: str, monkeypatc
     assert first in run("--help").out
 
 
-def test_adaptive_sweep_is_refused_rather_than_swept_in_steps(run: Run, tmp_path: Path) -> None:
-    said = run("scan", "--set", "sweep.mode=adaptive", "--out", "room.ply")
-    assert said.code == 2 and "adaptive" in said.err and "step, continuous" in said.err
-    assert not list(tmp_path.iterdir())
+def test_adaptive_sweep_looks_closer_where_the_room_jumps(run: Run, tmp_path: Path) -> None:
+    adaptive = (*QUICK, "--set", "sweep.mode=adaptive", "--set", "sweep.fine_deg=5", "--set", "sweep.step_deg=15")
+    said = run("scan", *adaptive, "--out", "a.ply")
+    assert said.code == 0 and "13 bearings" in said.out and "then every 5 deg where it is needed" in said.out
+    shots = list(open_source(tmp_path / "a.mcap").shots())
+    assert 13 < len(shots) <= 37 and [shot.index for shot in shots] == list(range(len(shots)))
+    assert run("replay", "a.mcap", "--out", "b.ply").code == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_scan_says_twin_first_and_leaves_cloud_map_recording(run: Run, tmp_path: Path) -> None:

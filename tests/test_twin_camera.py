@@ -84,8 +84,11 @@ def test_noise_belongs_to_the_view_whatever_was_shot_before() -> None:
     assert whole[0] != whole[3]
     assert shoot(params, head(320, 240), (0.2, True), (0.2, False), (0.1, True)) == [whole[2], whole[1], whole[0]]
     camera = TwinCamera(build_scene(params, params.light), head(320, 240), params, lambda: (0.1, True))
+    assert [camera.grab().image, camera.grab().image] == [whole[0], whole[3]]
+    camera.remember([0.3])
+    assert camera.grab().image == whole[0]
     camera.remember([0.1])
-    assert camera.grab().image == whole[3]
+    assert camera.grab().image not in whole
 
 
 def test_laser_off_is_the_same_picture_without_the_line() -> None:

@@ -32,6 +32,9 @@ def scan(
         Path | None, typer.Option("--record", metavar="F.mcap", help="The recording; beside --out by default.")
     ] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Keep no recording.")] = False,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", metavar="F.mcap", help="Go on with the scan recorded there.")
+    ] = None,
     rrd: RrdOption = None,
     view: ViewOption = False,
 ) -> None:
@@ -46,10 +49,13 @@ def scan(
 
     if record is not None and no_record:
         raise ConfigError("--record and --no-record exclude each other; give one")
-    outputs = session.Outputs.of_scan(tuple(out or ()), map_, record, rrd, keep=not no_record)
+    if resume is not None and (record is not None or no_record):
+        raise ConfigError("--resume goes on in a part beside its recording: leave --record and --no-record out")
+    keep = not no_record and resume is None
+    outputs = session.Outputs.of_scan(tuple(out or ()), map_, record, rrd, keep=keep)
     choice = session.Choice(config, tuple(set_ or ()), calibration)
     words = "stopping: the head parks, everything scanned is kept"
-    _run(lambda: session.prepare_scan(choice, outputs, view=view), "scanning", words)
+    _run(lambda: session.prepare_scan(choice, outputs, view=view, resume=resume), "scanning", words)
 
 
 def replay(

@@ -4,6 +4,7 @@ from scanmap.recording.info import RecordingInfo, TopicInfo, describe
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_writer import Recorder, whole_ns
 from scanmap.recording.opening import open_source
+from scanmap.recording.parts import is_later_part, next_part, part_path
 from scanmap.recording.recovery import recover
 from scanmap.recording.source import Source
 
@@ -14,7 +15,10 @@ __all__ = [
     "Source",
     "TopicInfo",
     "describe",
+    "is_later_part",
+    "next_part",
     "open_source",
+    "part_path",
     "recover",
     "whole_ns",
 ]

@@ -14,6 +14,7 @@ from scanmap.recording.mcap_records import DamagedError
 from scanmap.recording.messages import SECOND_NS, Fault, MalformedMessageError
 from scanmap.recording.opening import open_source
 from scanmap.recording.outline import Outline, outline
+from scanmap.recording.parts import part_outlines
 
 
 class TopicInfo(NamedTuple):
@@ -38,6 +39,7 @@ class RecordingInfo:
     plan: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)  # and whatever else was noted at the start
     topics: dict[str, TopicInfo] = field(default_factory=dict)
+    parts: tuple[tuple[Path, int], ...] = ()  # files it consists of, and the shots in each
     has_calibration: bool = False
     has_rig: bool = False
     faults: tuple[Fault, ...] = ()  # noted while scanning
@@ -59,6 +61,8 @@ class RecordingInfo:
             f"ended: {self._ended}",
             f"carries: {', '.join(carried) or 'neither calibration nor rig; replay it with --calibration F'}",
         ]
+        if len(self.parts) > 1:
+            lines.append("parts: " + ", ".join(f"{part.name} ({shots} shots)" for part, shots in self.parts))
         lines += [f"plan {key}: {value}" for key, value in self.plan.items()]
         lines += [f"{key}: {value}" for key, value in self.versions.items()]
         lines += [f"topic {name}: {topic.messages} {topic.message_type}" for name, topic in self.topics.items()]
@@ -79,7 +83,7 @@ def describe(path: Path | str, params: RecordingParams | None = None) -> Recordi
     """
     path, params = Path(path), params or RecordingParams()
     if path.suffix == ".mcap" and path.is_file():
-        return _describe_parts(path, [outline(path)], params)
+        return _describe_parts(path, part_outlines(path), params)
     source = open_source(path, params)
     if source.kind == "recording":
         parts = bag_parts(path) if path.is_dir() else [path]
@@ -101,8 +105,6 @@ def _describe_parts(path: Path, parts: list[Outline], params: RecordingParams) -
         for channel in part.directory.channels.values():
             before = topics.get(channel.topic, TopicInfo("", 0)).messages
             topics[channel.topic] = TopicInfo(channel.message_type, before + part.count(channel.topic))
-    start = min((part.first_ns for part in parts if part.first_ns is not None), default=0)
-    end = max((part.last_ns for part in parts if part.last_ns is not None), default=0)
     source, plan = about.pop("source", ""), about.pop("plan", "")
     about.pop("start_ns", None)
     return RecordingInfo(
@@ -110,10 +112,11 @@ def _describe_parts(path: Path, parts: list[Outline], params: RecordingParams) -
         "recording",
         source=source,
         shots=sum(part.count(params.image_topic) for part in parts),
-        duration_s=(end - start) / SECOND_NS,
+        duration_s=_duration_s(parts, len(parts) > 1 and not path.is_dir()),
         size_bytes=sum(part.size for part in parts),
         end_reason=last.metadata.get(layout.END_METADATA, {}).get("reason", ""),
-        cut_at=next((part.cut_at for part in parts if part.cut), None),
+        cut_at=last.cut_at if path.is_file() else next((part.cut_at for part in parts if part.cut), None),
+        parts=tuple((part.path, part.count(params.image_topic)) for part in parts),
         plan=_plan(plan),
         versions=about,
         topics=dict(sorted(topics.items())),
@@ -121,6 +124,17 @@ def _describe_parts(path: Path, parts: list[Outline], params: RecordingParams) -
         has_rig=layout.RIG_ATTACHMENT in first.attachments,
         faults=tuple(fault for part in parts for fault in _faults(part)),
     )
+
+
+def _duration_s(parts: list[Outline], resumed: bool) -> float:
+    """From the first message to the last; of a resumed scan without the time between its parts."""
+    spans = [(part.first_ns, part.last_ns) for part in parts]
+    known = [(first, last) for first, last in spans if first is not None and last is not None]
+    if not known:
+        return 0.0
+    if resumed:
+        return sum(last - first for first, last in known) / SECOND_NS
+    return (max(last for _, last in known) - min(first for first, _ in known)) / SECOND_NS
 
 
 def _plan(text: str) -> dict[str, Any]:

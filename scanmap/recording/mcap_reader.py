@@ -13,22 +13,22 @@ from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_records import Break, Channel, DamagedError, Directory, Message, Record
 from scanmap.recording.messages import MalformedMessageError
 from scanmap.recording.outline import Outline, outline
+from scanmap.recording.parts import part_outlines
 from scanmap.recording.source import Report, Source
 from scanmap.shot import Shot
 
 
 def mcap_source(path: Path, params: RecordingParams) -> Source:
-    """Open a recording, or a bag folder with its parts.
+    """Open a recording with the parts that continue it, or a bag folder.
 
     Raises:
         RecordingError: not an MCAP file, unreadable, or without the topics that make shots.
     """
-    parts = bag_parts(path) if path.is_dir() else [path]
-    outlines = [outline(part) for part in parts]
+    outlines = [outline(part) for part in bag_parts(path)] if path.is_dir() else part_outlines(path)
     for found in outlines:
         _require_topics(found, params)
     first, last = outlines[0], outlines[-1]
-    cut = any(found.cut for found in outlines)
+    cut = any(found.cut for found in outlines) if path.is_dir() else last.cut
     end = last.metadata.get(layout.END_METADATA, {})
     counts = [found.count(params.image_topic) for found in outlines]
     return Source(
@@ -39,6 +39,7 @@ def mcap_source(path: Path, params: RecordingParams) -> Source:
         rig_toml=first.attachments.get(layout.RIG_ATTACHMENT, ""),
         metadata=dict(first.metadata.get(layout.START_METADATA, {})),
         count=sum(counts),
+        parts=tuple(found.path for found in outlines),
         end_reason="cut" if cut else end.get("reason", ""),
         faults=[fault for found in outlines for fault in found.faults],
     )

@@ -60,7 +60,9 @@ class Recorder:
         metadata: anything else worth keeping (versions of firmware and libraries).
         expected_shots: from the plan; lets a disk that is too small be noticed at the first shot. 0 = unknown.
         overwrite: replace a file that exists.
-        start_ns: wall clock at the time 0 of the shots [ns since 1970]; now, if left out.
+        start_ns: wall clock at the time 0 of the shots [ns since 1970]; now, if left out. The parts of one scan
+            have it in common.
+        begun_ns: when this file begins, where that is later: a part that continues another.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class Recorder:
         expected_shots: int = 0,
         overwrite: bool = False,
         start_ns: int | None = None,
+        begun_ns: int | None = None,
         params: RecordingParams | None = None,
     ) -> None:
         self.path = Path(path)
@@ -84,6 +87,7 @@ class Recorder:
         self._calibration = calibration
         self._expected_shots = expected_shots
         self._start_ns = time.time_ns() if start_ns is None else start_ns
+        self._begun_ns = begun_ns or self._start_ns
         self._schemas: dict[str, int] = {}
         self._lock = threading.Lock()
         self._check_disk(0)
@@ -200,8 +204,8 @@ class Recorder:
         except OSError as error:
             self._file.close()
             raise self._cannot_write(error) from error
-        transforms = messages.static_transforms(self._start_ns, self._calibration, p.joint)
-        self._write_chunk(self._start_ns, [(layout.TF_STATIC_TOPIC, transforms)], 0)
+        transforms = messages.static_transforms(self._begun_ns, self._calibration, p.joint)
+        self._write_chunk(self._begun_ns, [(layout.TF_STATIC_TOPIC, transforms)], 0)
 
     def _note(self, name: str, data: dict[str, str]) -> None:
         self._writer.add_metadata(name, data | {layout.METADATA_CRC: layout.metadata_crc(data)})

@@ -26,6 +26,7 @@ class Source:
     rig_toml: str = ""  # text of the rig's configuration; empty when none came with it
     metadata: dict[str, str] = field(default_factory=dict)
     count: int | None = None  # shots it should hold, as far as that is known beforehand
+    parts: tuple[Path, ...] = ()  # the files of a recording, in order
     end_reason: str = ""  # `finished`, `interrupted`, `error: ...`, `cut`; empty where nobody noted it
     faults: list[str] = field(default_factory=list)  # one line each; complete when `shots` has ended
 

@@ -117,6 +117,16 @@ class GrblStage:
             raise StageError(self._link.fault)
         return math.radians(here)
 
+    def stand_at(self, bearing: float) -> None:
+        """From now on the place where the head stands is `bearing` [rad]: somebody who can see it says so.
+
+        Raises:
+            StageError: no answer.
+        """
+        machine_deg = self._machine_deg(self._status())
+        self._zero_deg = machine_deg - self._params.direction * (math.degrees(bearing) - self._params.home_deg)
+        self._from_below = False
+
     def laser(self, on: bool) -> None:
         """Switch the laser; does nothing where it cannot be switched.
 
@@ -138,6 +148,8 @@ class GrblStage:
         Raises:
             StageError: no switch or mark was found.
         """
+        if self._link.fault:
+            self._link.reset()  # a board that a limit switch stopped hears nothing else
         if self._params.homing == "switch":
             single = self.dialect is not Dialect.GRBL
             self._link.command("$HX" if single else "$H", despite_fault=True, silence_s=HOMING_S)

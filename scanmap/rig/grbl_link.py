@@ -121,7 +121,7 @@ class GrblLink:
                         pass
                 self._answered, self.in_motion = True, False
                 for line in self.preamble if self.status().state != "Alarm" else []:
-                    self.command(line)
+                    self.command(line, despite_fault=True)
                 return banner
         raise StageError(self._silence())
 

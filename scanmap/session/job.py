@@ -22,6 +22,7 @@ from scanmap.recording import Recorder
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
 from scanmap.session.outputs import Outputs, write_results
+from scanmap.session.refining import Refinement
 from scanmap.session.summary import Summary, summarise
 from scanmap.shot import Shot
 from scanmap.twin import Truth, TruthReport
@@ -81,8 +82,12 @@ class Job:
     view: View | None = None
     truth: Truth | None = None
     source_faults: list[str] = field(default_factory=list)
+    earlier: Callable[[], Iterable[Shot]] | None = None  # shots of the parts that this scan continues
+    refinement: Refinement | None = None  # of an adaptive sweep
     closers: list[Callable[[], None]] = field(default_factory=list)
     done: int = 0  # shots processed so far
+    faults: list[str] = field(default_factory=list)  # seen so far, one line each
+    _last_s: float = 0.0  # time of the last shot
 
     def __enter__(self) -> Job:
         return self
@@ -104,12 +109,11 @@ class Job:
             Exception: the very first shot failed, so there is nothing to keep; a ScanmapError where foreseen.
         """
         scan = Scan(self.calibration.mount, self.calibration.intrinsics.height, self.comments)
-        faults: list[str] = []
         ended = "finished"
         error: Exception | None = None
         try:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
-            sinks = self._sinks(scan, faults, progress)
+            sinks = self._sinks(scan, progress)
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
             with closing(self._recorded()) as shots, self.workers(pipeline) as (process, threads):
                 run(checked(shots, self.calibration), process, sinks, stop, threads)
@@ -121,18 +125,27 @@ class Job:
             kind = "" if isinstance(raised, ScanmapError) else f"{type(raised).__name__}: "
             ended, error = f"error: {kind}{raised}", raised
         finally:
-            self._close_recording(ended, faults)
+            self._close_recording(ended)
         if error is not None and not len(scan):
             raise error
         if not len(scan):
             if ended == "interrupted":
                 raise KeyboardInterrupt
             raise RecordingError("there is no shot to make a scan of")
-        return self._finished(scan, faults, ended, error)
+        return self._finished(scan, ended, error)
+
+    def note(self, fault: str) -> None:
+        """Keep a fault that was overcome, in the result and in the recording."""
+        self.faults.append(fault)
+        if self.recorder is not None and not self.recorder.closed:
+            self.recorder.fault(fault, part="sweep", seconds=self._last_s)
 
     @contextmanager
     def workers(self, pipeline: Pipeline) -> Iterator[tuple[Callable[[Shot], Step], int]]:
         """What processes a shot, and in how many threads; a live scan waits for its camera, not for a core."""
+        if self.refinement is not None:
+            yield self.refinement.collecting(pipeline.process), 0
+            return
         if not self.recorded or not worth_processes(self.total):
             yield pipeline.process, 0
             return
@@ -143,18 +156,24 @@ class Job:
         """The shots, each in the recording before anything is done with it."""
         source = self.shots()
         try:
+            for shot in self.earlier() if self.earlier is not None else ():
+                yield self._handed_out(shot)
             for shot in source:
-                yield self.recorder.write(shot) if self.recorder is not None else shot
+                yield self._handed_out(self.recorder.write(shot) if self.recorder is not None else shot)
         finally:
             if isinstance(source, Generator):
                 source.close()
 
-    def _sinks(self, scan: Scan, faults: list[str], progress: Callable[[Progress], None]) -> list[Sink]:
+    def _handed_out(self, shot: Shot) -> Shot:
+        self._last_s = shot.time
+        return self.refinement.hand_out(shot) if self.refinement is not None else shot
+
+    def _sinks(self, scan: Scan, progress: Callable[[Progress], None]) -> list[Sink]:
         def collect(step: Step) -> None:
             scan.add(step.profile, step.shot.bearing)
             self.done += 1
             if step.fault:
-                faults.append(f"shot {step.shot.index} at {np.degrees(step.shot.bearing):.3f} deg: {step.fault}")
+                self.faults.append(f"shot {step.shot.index} at {np.degrees(step.shot.bearing):.3f} deg: {step.fault}")
                 if self.recorder is not None:
                     self.recorder.fault(step.fault, part="camera", seconds=step.shot.time)
 
@@ -175,15 +194,15 @@ class Job:
 
         return show
 
-    def _close_recording(self, ended: str, faults: list[str]) -> None:
+    def _close_recording(self, ended: str) -> None:
         if self.recorder is None:
             return
         try:
             self.recorder.close(ended)
         except RecordingError as error:
-            faults.append(str(error))
+            self.faults.append(str(error))
 
-    def _finished(self, scan: Scan, faults: list[str], ended: str, error: Exception | None) -> Result:
+    def _finished(self, scan: Scan, ended: str, error: Exception | None) -> Result:
         clean = finished_scan(scan, self.config)
         summary = summarise(clean, self.calibration)
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
@@ -202,7 +221,7 @@ class Job:
             ended=ended,
             shots=self.done,
             error=error,
-            faults=[*self.source_faults, *faults],
+            faults=[*self.source_faults, *self.faults],
             files=files,
             unwritten=unwritten,
             truth=self.truth.compare(clean.points[clean.valid], clean.bearings) if self.truth is not None else None,
@@ -229,7 +248,7 @@ class Job:
             if not self.done and self.outputs.rrd is not None:
                 self.outputs.rrd.unlink(missing_ok=True)
         if self.recorder is not None:
-            self._close_recording("interrupted", [])
+            self._close_recording("interrupted")
             if not self.recorder.shots:
                 self.recorder.path.unlink(missing_ok=True)
 

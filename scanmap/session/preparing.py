@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,10 @@ from scanmap.recording.video import VIDEO_SUFFIXES
 from scanmap.rig import Rig
 from scanmap.session.job import Job
 from scanmap.session.outputs import Outputs
+from scanmap.session.resuming import Earlier, earlier_parts
 from scanmap.session.rigs import TWIN_NAME, open_rig
-from scanmap.sweep import plan, sweep
+from scanmap.session.sweeping import Sweeping
+from scanmap.sweep import Plan, plan
 from scanmap.view import open_view, show
 from scanmap.view.viewer import has_display
 
@@ -52,47 +54,58 @@ class Choice:
         return Calibration.load(self.calibration)
 
 
-def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool) -> Job:
+def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool, resume: Path | None = None) -> Job:
     """Open the rig that a configuration names, and everything its sweep will be written to.
 
     What fails here leaves no file behind.
 
+    Args:
+        resume: recording of an interrupted scan to go on with; it brings its configuration and calibration.
+
     Raises:
-        ConfigError, CalibrationError, StageError, CameraError, RecordingError: before anything turns.
+        ConfigError, CalibrationError, StageError, CameraError, RecordingError: before anything turns; of a resumed
+            scan, before anything is shot.
     """
-    config = choice.load()
+    earlier = _earlier(choice, resume) if resume is not None else None
+    config = earlier.config if earlier is not None else choice.load()
     if config.rig == "replay-only":
         raise ConfigError(
             f"configuration {choice.config} has rig = {config.rig!r}: it describes recordings, not a rig that is here; "
             f"try scanmap replay SOURCE --config {choice.config}"
         )
-    if config.sweep.mode == "adaptive":
-        # The sweep can do it, but nothing here tells it yet where to look closer: it would be a step sweep in disguise.
-        raise ConfigError("sweep.mode = 'adaptive' is not available in scan yet; valid here: step, continuous")
+    if earlier is not None:
+        outputs = replace(outputs, record=earlier.part)
     outputs.check()
     if view:
         require_display(INSTEAD_OF_VIEW)
-    head = choice.head() or config.head()
+    head = earlier.calibration if earlier is not None else choice.head() or config.head()
     check_residuals(head)
-    swept = plan(config.sweep, _limits(config))
+    swept = plan(config.sweep, config.stage.limits)
     opened = open_rig(config, head)
     is_twin = opened.rig.is_twin
+    sweeping = Sweeping(config, head, opened, swept, earlier)
     job = Job(
         config=config,
         calibration=head,
         outputs=outputs,
-        shots=lambda: sweep(opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock),
+        shots=sweeping.shots,
         total=len(swept.bearings),
         comments=_comments(is_twin=is_twin),
         announcement=[rig_words(config, opened.rig), swept.words],
+        earlier=earlier.source.shots if earlier is not None else None,
+        refinement=sweeping.refinement,
         truth=opened.truth,
         closers=[opened.close],
     )
+    sweeping.note = job.note
     with _opened(job):
         if not is_twin:
             head.check_image(opened.rig.camera.width, opened.rig.camera.height)
+        if earlier is not None:
+            job.announcement += [earlier.words, sweeping.prove_place()]
+            job.source_faults = earlier.source.faults
         _open_view(job, title=config.description or opened.rig.name, is_twin=is_twin, live=view)
-        job.recorder = _recorder(config, head, outputs, swept.as_metadata(), len(swept.bearings), opened.rig.name)
+        job.recorder = _recorder(config, head, outputs, swept, opened.rig.name, earlier)
     return job
 
 
@@ -152,9 +165,12 @@ def _opened(job: Job) -> Iterator[None]:
         raise
 
 
-def _limits(config: Config) -> tuple[float, float]:
-    """How far the head may turn [rad]."""
-    return math.radians(config.stage.min_deg), math.radians(config.stage.max_deg)
+def _earlier(choice: Choice, resume: Path) -> Earlier:
+    if choice.config is not None or choice.calibration is not None:
+        raise ConfigError(
+            "--resume takes configuration and calibration from the recording: leave --config and --calibration out"
+        )
+    return earlier_parts(resume, choice.settings)
 
 
 def _source(path: Path, bearings: Path | None, choice: Choice) -> tuple[Config, Source]:
@@ -189,13 +205,14 @@ def rig_words(config: Config, rig: Rig) -> str:
 
 def _announcement(source: Source) -> str:
     shots = "1 shot" if source.count == 1 else f"{'' if source.count is None else f'{source.count} '}shots"
+    parts = f" in {len(source.parts)} parts" if len(source.parts) > 1 and source.path.is_file() else ""
     made_up = "; DIGITAL TWIN, its room is made up" if source.is_twin else ""
     ended = {"": "", "finished": "", "cut": ", which is cut"}.get(source.end_reason, f", {source.end_reason}")
-    return f"replaying {shots} of {source.path}{ended}{made_up}"
+    return f"replaying {shots} of {source.path}{parts}{ended}{made_up}"
 
 
 def _recorder(
-    config: Config, head: Calibration, outputs: Outputs, planned: Mapping[str, object], shots: int, source: str
+    config: Config, head: Calibration, outputs: Outputs, planned: Plan, source: str, earlier: Earlier | None
 ) -> Recorder | None:
     if outputs.record is None:
         return None
@@ -208,8 +225,11 @@ def _recorder(
             calibration=head,
             source=source,
             rig_toml=rig_toml,
-            plan=planned,
-            expected_shots=shots,
+            plan=planned.as_metadata(),
+            metadata={"continues": earlier.source.path.name} if earlier is not None else None,
+            expected_shots=len(planned.bearings) - (earlier.shots if earlier is not None else 0),
+            start_ns=earlier.start_ns if earlier is not None else None,
+            begun_ns=time.time_ns() if earlier is not None else None,
             params=config.recording,
         )
     except RecordingError:

@@ -15,10 +15,8 @@ from scanmap.triangulation import column_window
 EVERY_ROW = 8  # of those that are asked for a line: the question is only whether there is one
 
 
-def watch_of(config: Config, calibration: Calibration) -> Watch | None:
-    """The watch over a sweep; None where the configuration wants none."""
-    if not config.sweep.watch:
-        return None
+def watch_of(config: Config, calibration: Calibration) -> Watch:
+    """The watch over a sweep with this head."""
     params = config.laserline.model_copy(update={"pool_rows": 1})  # rows so far apart do not help each other
     window = column_window(calibration, config.triangulation)[::EVERY_ROW]
     grey = not needs_colour(params)

@@ -5,6 +5,7 @@ The pictures are compared without the laser line, which turns with the head and 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -18,7 +19,14 @@ LINE_PX = 12  # to either side of a row's brightest pixel, of the reduced pictur
 BLUR_PX, BROAD_PX = 1.0, 8.0  # noise is finer than what is compared; a laser line narrower than its surroundings
 LINE_DN = 15.0  # [grey levels] by which a line stands out at least
 ELSEWHERE = 0.05  # share of the rows whose line may be elsewhere in pictures of one place: speckle, noise
-SURE = 9.0  # standard deviations; the highest of 10^5 values of pure noise reaches 5
+SURE = 6.0  # standard deviations; the highest of 10^5 values of pure noise reaches 5
+ALIKE = 0.45  # true pairs of the twin's rooms have 0.55 and more, chance likenesses 0.32 at most
+ALIKE_BLUR_PX = 2.0
+BETTER = 0.1  # by so much a shift must explain the pictures better than none
+SAME_PX, SAME_SIGMA = (
+    0.5,
+    5.0,
+)  # [px of the small pictures], [standard deviations]: two of one place are no farther apart
 
 F32 = NDArray[np.float32]
 
@@ -28,12 +36,30 @@ class Shift(NamedTuple):
 
     columns_px: float  # of the picture as it came
     scale: float  # pixels of that picture in one of those compared
+    error_px: float  # standard deviation of columns_px, of noise alone
     certainty: float  # height of the correlation's peak above its surroundings [standard deviations]
+    likeness: float  # correlation coefficient of what the two pictures have in common then
+    likeness_unmoved: float  # the same, had they not moved
 
     @property
     def is_sure(self) -> bool:
         """Whether the pictures show enough of the same to tell."""
-        return self.certainty >= SURE
+        return self.certainty >= SURE and self.likeness >= ALIKE
+
+    @property
+    def slack_px(self) -> float:
+        """How far two pictures of one place may seem to be apart."""
+        return SAME_PX * self.scale + SAME_SIGMA * self.error_px
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the pictures can be of one place."""
+        return abs(self.columns_px) <= self.slack_px
+
+    @property
+    def is_proved(self) -> bool:
+        """Whether the pictures cannot be of one place: moved, they are clearly more alike."""
+        return not self.is_small and self.likeness - self.likeness_unmoved > BETTER
 
 
 def shift_between(before: bytes, after: bytes) -> Shift:
@@ -57,7 +83,25 @@ def shift_between(before: bytes, after: bytes) -> Shift:
     bend = around[0] - 2.0 * around[1] + around[2]
     place = column + (0.5 * (around[0] - around[2]) / bend if bend < 0 else 0.0)
     wrapped = (place + surface.shape[1] / 2) % surface.shape[1] - surface.shape[1] / 2
-    return Shift(float(wrapped) * scale, scale, certainty)
+    # Noise of this spread moves the top of a parabola by its slope over the parabola's bend.
+    error = spread / (math.sqrt(2.0) * -bend) if bend < 0 else math.inf
+    likeness, unmoved = (_likeness(first, second, columns) for columns in (round(wrapped), 0))
+    return Shift(float(wrapped) * scale, scale, error * scale, certainty, likeness, unmoved)
+
+
+def _likeness(first: F32, second: F32, columns: int) -> float:
+    """Correlation coefficient (-1 to 1) of two structures, the second moved back by whole columns."""
+    if columns < 0:
+        first, second, columns = second, first, -columns
+    width = first.shape[1] - columns
+    a, b = (cv2.GaussianBlur(part, (0, 0), ALIKE_BLUR_PX) for part in (first[:, :width], second[:, columns:]))
+    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / size if size > 0 else 0.0
+
+
+def scale_of(width: int) -> float:
+    """How many pixels of a picture make one of those that are compared."""
+    return max(1.0, width / WIDTH)
 
 
 def same_line(before: bytes, after: bytes) -> bool:
@@ -111,6 +155,6 @@ def _small(image: bytes) -> tuple[F32, float]:
         grey = None
     if grey is None:
         raise CameraError(f"picture of {len(image)} bytes cannot be decoded")
-    scale = max(1.0, grey.shape[1] / WIDTH)
+    scale = scale_of(grey.shape[1])
     size = (round(grey.shape[1] / scale), round(grey.shape[0] / scale))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32), scale

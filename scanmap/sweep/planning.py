@@ -42,6 +42,9 @@ class SweepParams(BaseModel, frozen=True, extra="forbid"):
         0.0, ge=-1.0, le=5.0, description="continuous: how much later than the exposure a frame is stamped [s]"
     )
     fine_deg: float = Field(0.25, gt=0.0, le=360.0, description="adaptive: finest step [deg]")
+    spacing_m: float = Field(
+        0.06, gt=0.0, le=10.0, description="adaptive: points farther apart than this get bearings between them [m]"
+    )
     settle_s: float = Field(0.15, ge=0.0, le=60.0, description="rest between arrival and exposure [s]")
     off_frames: bool = Field(False, description="also shoot each bearing with the laser off (Shot.background)")
     retries: int = Field(3, ge=0, le=100, description="how often a failed frame is taken again")
@@ -154,14 +157,17 @@ def plan(params: SweepParams, limits: tuple[float, float] = CABLE_LIMITS) -> Pla
     return Plan(bearings, turning / TURN_RAD_S + len(bearings) * params.settle_s + frames * FRAME_S, params)
 
 
-def between(bearings: NDArray[np.float64], gaps: NDArray[np.bool_], fine_deg: float) -> NDArray[np.float64]:
+def between(
+    bearings: NDArray[np.float64], gaps: NDArray[np.bool_], fine_deg: float | NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Bearings that fill the gaps of a coarse pass evenly, in steps of at most `fine_deg`.
 
     Args:
         bearings: (N,) of the coarse pass, in order [rad].
         gaps: (N - 1,) which of the gaps between neighbours to fill.
+        fine_deg: for all gaps, or (N - 1,) for each [deg].
     """
-    parts = np.ceil(np.abs(np.diff(bearings)) / math.radians(fine_deg) - 1e-9).astype(int)
+    parts = np.ceil(np.abs(np.diff(bearings)) / np.radians(fine_deg) - 1e-9).astype(int)
     filled = [
         np.linspace(bearings[gap], bearings[gap + 1], parts[gap] + 1)[1:-1]
         for gap in np.flatnonzero(np.asarray(gaps, bool))

@@ -38,10 +38,27 @@ class Homable(Protocol):
         ...
 
 
+@runtime_checkable
+class Settable(Protocol):
+    """A stage that can be told where it stands."""
+
+    def stand_at(self, bearing: float) -> None:
+        """From now on the head's present place is `bearing` [rad]. Raises StageError."""
+        ...
+
+
 class Steps:
     """One sweep in steps."""
 
-    def __init__(self, rig: Rig, planned: Plan, sleep: Callable[[float], None], watch: Watch | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        planned: Plan,
+        sleep: Callable[[float], None],
+        watch: Watch | None = None,
+        note: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._note = note
         self._rig = rig
         self._planned = planned
         self._params = planned.params
@@ -98,6 +115,12 @@ class Steps:
                 continue
             return Shot(index, reported, bearing, frame.time, frame.image, background)
 
+    def look(self) -> Shot:
+        """A picture from where the head stands; nothing turns. Raises StageError, CameraError."""
+        frame, background = self._take()
+        here = self._rig.stage.where()
+        return Shot(0, here, here, frame.time, frame.image, background)
+
     def _confirmed(self, shot: Shot) -> Shot:
         """The shot, if its picture raises no doubt; else what another look settles."""
         watch = self._watch
@@ -105,7 +128,7 @@ class Steps:
         if watch is None or doubt is None or watch.last is None:
             return shot
         logger.info("shot %d: %s; looking again from the last bearing", shot.index, doubt.value)
-        trusted = watch.last
+        trusted, rehomings_left = watch.last, self._rehomings_left
         while wrong := self._what_is_wrong(watch, doubt, trusted, shot):
             if doubt is Doubt.LASER:
                 raise StageError(
@@ -119,7 +142,11 @@ class Steps:
                 )
             )
         watch.pardon(doubt)
-        return self.shoot(shot.index, shot.bearing_commanded)
+        if doubt is Doubt.WAY and self._rehomings_left == rehomings_left:
+            return shot
+        again = self.shoot(shot.index, shot.bearing_commanded)
+        # A loose contact puts the laser out for one picture only; where there is no line, the first picture will do.
+        return shot if doubt is Doubt.LASER and watch.confirms(doubt, again) else again
 
     def _what_is_wrong(self, watch: Watch, doubt: Doubt, trusted: Shot, shot: Shot) -> str:
         """What further looks say of a doubt, in words; empty where the head and the laser are well."""
@@ -155,6 +182,7 @@ class Steps:
             raise error
         self._rehomings_left -= 1
         logger.warning("%s; homing again (%d more times at most)", error, self._rehomings_left)
+        self._note(f"{error}; the head was homed again")
         stage.home()
 
     def _expose(self, index: int) -> None:
@@ -169,9 +197,9 @@ class Steps:
         stage, retries, background = self._rig.stage, self._params.retries, None
         if self._params.off_frames and stage.laser_switchable:
             stage.laser(False)
-            background = grab(self._rig.camera, retries).image
+            background = grab(self._rig.camera, retries, self._note).image
         stage.laser(True)
-        return grab(self._rig.camera, retries), background
+        return grab(self._rig.camera, retries, self._note), background
 
 
 def expose(camera: Camera, exposure_us: float) -> None:
@@ -186,7 +214,7 @@ def expose(camera: Camera, exposure_us: float) -> None:
     camera.expose(exposure_us)
 
 
-def grab(camera: Camera, retries: int, *, moving: bool = False) -> Frame:
+def grab(camera: Camera, retries: int, note: Callable[[str], None], *, moving: bool = False) -> Frame:
     """A frame, asked for again where it cannot be used; the newest that has come where the head is `moving`.
 
     Raises:
@@ -203,4 +231,5 @@ def grab(camera: Camera, retries: int, *, moving: bool = False) -> Frame:
                     "sweep.retries; `scanmap doctor` shows what it delivers"
                 ) from error
             logger.warning("frame taken again (%d of %d): %s", attempt + 1, retries, error)
+            note(f"frame taken again: {error}")
     raise AssertionError("unreachable")

@@ -57,6 +57,7 @@ def sweep(
     refine: Refine | None = None,
     watch: Watch | None = None,
     done: Collection[int] = (),
+    note: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Shot]:
     """Shoot a rig around, bearing by bearing.
 
@@ -70,6 +71,7 @@ def sweep(
         refine: adaptive sweeps ask it for further bearings after the first pass.
         watch: holds the pictures against each other, to notice lost steps, a stalled motor and a dead laser.
         done: indices of shots that an interrupted sweep took already; not for continuous ones.
+        note: told of every fault that was overcome: a retry, a homing.
 
     Yields:
         `Shot` with the bearing that the stage reported; time counts from the first frame.
@@ -84,8 +86,8 @@ def sweep(
     if params.mode == "continuous":
         if not isinstance(rig.stage, Turning):
             raise ConfigError("sweep.mode = 'continuous' needs a stage of kind grbl: choose step or adaptive")
-        return _guarded(rig, params, planned, _turn(rig, rig.stage, planned, stop, clock))
-    steps = Steps(rig, planned, sleep, watch)
+        return _guarded(rig, params, planned, _turn(rig, rig.stage, planned, stop, clock, note))
+    steps = Steps(rig, planned, sleep, watch, note)
     return _guarded(rig, params, planned, steps.shots(stop, refine, done))
 
 
@@ -103,7 +105,12 @@ def _guarded(rig: Rig, params: SweepParams, planned: Plan, shots: Iterator[Shot]
 
 
 def _turn(
-    rig: Rig, stage: Turning, planned: Plan, stop: Callable[[], bool], clock: Callable[[], float]
+    rig: Rig,
+    stage: Turning,
+    planned: Plan,
+    stop: Callable[[], bool],
+    clock: Callable[[], float],
+    note: Callable[[str], None],
 ) -> Iterator[Shot]:
     """Shoot while turning; a frame's bearing is interpolated between what the stage reported around it.
 
@@ -122,7 +129,7 @@ def _turn(
         stage.start_turn(end, speed)
         last = -math.inf
         while abs(track[-1][1] - start) < abs(end - start) - 1e-4 and not stop():
-            frame = grab(rig.camera, params.retries, moving=True)
+            frame = grab(rig.camera, params.retries, note, moving=True)
             track = [*track[-HISTORY:], _sample(rig, clock)]
             bearing = _steady_bearing(track, frame.time - params.latency_s, speed)
             if math.isnan(bearing) or abs(bearing - last) < math.radians(params.step_deg) * 0.99:

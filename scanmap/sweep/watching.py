@@ -16,10 +16,9 @@ from scanmap.sweep.matching import Shift, same_line, shift_between
 
 Lit = Callable[[bytes, bytes | None], float]  # share of rows that show the laser line, of a picture and its background
 
-WAY_SHARE, WAY_PX = 0.4, 1.0  # of the way expected, and at least: nearness of things and noise make as much
+WAY_SHARE = 0.25  # of the way expected: nearness of things makes as much
 LIT_BEFORE, LIT_NOW = 0.1, 0.01  # shares of rows between which a laser that shone is thought to be out
-FARTHEST = 0.4  # of the picture's width: pictures farther apart have too little in common
-SAME_PX = 0.5  # of the small picture: from one bearing two pictures are farther apart only if the head has moved
+FARTHEST = 0.15  # of the picture's width: pictures farther apart have too little in common
 FALSE_ALARMS = 3  # so many, and the pictures of this room are no witness
 
 
@@ -40,7 +39,7 @@ class Watch:
     """
 
     def __init__(self, px_per_rad: float, width: int, lit: Lit | None = None) -> None:
-        self._px_per_rad = px_per_rad
+        self.px_per_rad = px_per_rad
         self._width = width
         self._lit = lit
         self._lit_before = 0.0
@@ -49,6 +48,10 @@ class Watch:
         self.first: Shot | None = None
         self.last: Shot | None = None  # whose bearing and laser are trusted
         self.dark = False  # whether going without a line was looked into already
+
+    def overlap(self, shift: Shift) -> bool:
+        """Whether pictures so far apart have enough in common for the shift to be believed."""
+        return abs(shift.columns_px) < FARTHEST * self._width
 
     def trust(self, shot: Shot) -> None:
         """The next shot will be held against this one."""
@@ -67,12 +70,12 @@ class Watch:
             return Doubt.LASER
         if not self._asks(Doubt.WAY):
             return None
-        expected = self._px_per_rad * (shot.bearing - self.last.bearing)
-        shift = self._shift(self.last, shot)
-        odd = shift is not None and abs(shift.columns_px - expected) > max(
-            WAY_SHARE * abs(expected), WAY_PX * shift.scale
-        )
-        return Doubt.WAY if odd and abs(expected) < FARTHEST * self._width else None
+        expected = self.px_per_rad * (shot.bearing - self.last.bearing)
+        shift = self.shift(self.last, shot)
+        if shift is None or not self.overlap(shift) or abs(expected) >= FARTHEST * self._width:
+            return None
+        slack = max(WAY_SHARE * abs(expected), shift.slack_px)
+        return Doubt.WAY if abs(shift.columns_px - expected) > slack else None
 
     def confirms(self, doubt: Doubt, again: Shot) -> str:
         """What another look from the last trusted bearing says of a doubt: what is wrong, in words; or nothing."""
@@ -84,18 +87,18 @@ class Watch:
 
     def displaced(self, shot: Shot, again: Shot) -> str:
         """By how much the head stands elsewhere than for an earlier shot of this bearing; empty where it does not."""
-        shift = self._shift(shot, again)
-        if shift is None or abs(shift.columns_px) <= SAME_PX * shift.scale:
+        shift = self.shift(shot, again)
+        if shift is None or not shift.is_proved:
             return ""
         return (
             f"the picture at {degrees(again.bearing):.2f} deg is shifted by {shift.columns_px:.1f} px, the head off by "
-            f"about {degrees(shift.columns_px / self._px_per_rad):.2f} deg"
+            f"about {degrees(shift.columns_px / self.px_per_rad):.2f} deg"
         )
 
     def stands(self, shot: Shot, elsewhere: Shot) -> bool:
         """Whether two shots that are said to be far apart show the same: room and line in the same place."""
-        shift = self._shift(shot, elsewhere)
-        if shift is not None and abs(shift.columns_px) > SAME_PX * shift.scale:
+        shift = self.shift(shot, elsewhere)
+        if shift is None or not shift.is_small:
             return False
         try:
             return same_line(shot.image, elsewhere.image)
@@ -103,7 +106,7 @@ class Watch:
             return False
 
     def pardon(self, doubt: Doubt) -> None:
-        """It was a false alarm; after a few the pictures are asked no more."""
+        """It was a false alarm; after a few the pictures of this room are asked no more."""
         self._alarms[doubt] += 1
 
     def _asks(self, doubt: Doubt) -> bool:
@@ -120,7 +123,7 @@ class Watch:
         return self._lit_of[1]
 
     @staticmethod
-    def _shift(before: Shot, after: Shot) -> Shift | None:
+    def shift(before: Shot, after: Shot) -> Shift | None:
         """Shift of a shot's room; None where it cannot be told."""
         try:
             if before.background is not None and after.background is not None:

@@ -25,6 +25,7 @@ from scanmap.twin.sensor import STEPS, Coded, Sensor, SensorParams
 F32 = NDArray[np.float32]
 
 COARSE = 4  # [px] the room is cast in steps of this, and finely only at its edges
+VIEW_DIGITS = 9  # bearings [rad] alike to so many decimals are one view
 EDGE_DN = 4.0  # [grey levels] a place is an edge from this difference between itself and its surroundings
 
 
@@ -65,8 +66,8 @@ class TwinCamera:
         rng: of noise and speckle; left out, one from `params.seed`.
         clock: [s] monotonic.
 
-    Noise belongs to the view: the n-th picture at a bearing, with the laser on or off, is the same whatever was
-    shot before it, so that a scan in two parts equals one in a single go.
+    Noise belongs to the view and to how often it was shot, as `remember` is told: what else was looked at does not
+    matter, so that a scan in two parts equals one in a single go.
     """
 
     def __init__(
@@ -84,7 +85,8 @@ class TwinCamera:
         self._state, self._clock = state, clock
         self._rng = np.random.default_rng(params.seed) if rng is None else rng
         self._frames_seed = int(self._rng.integers(1 << 62))
-        self._visits: Counter[tuple[float, bool]] = Counter()
+        self._taken: Counter[float] = Counter()  # taken of each view
+        self._looks: Counter[tuple[float, bool]] = Counter()  # at each view since the last shot
         self._sensor = Sensor(params.sensor, own.width, own.height, self._rng)
         self._fan = LaserFan(scene, calibration, params.laser, params.sensor.blur_px)
         self._speckle = _speckle_tile(params.laser.speckle, own.height, self._rng)
@@ -119,8 +121,9 @@ class TwinCamera:
         return Frame(self._sensor.read_out(coded, amplitude, rng), now)
 
     def remember(self, bearings: Iterable[float]) -> None:
-        """Go on as after one picture with the laser off and one with it on at each of these true `bearings` [rad]."""
-        self._visits = Counter((bearing, on) for bearing in bearings for on in (True, False))
+        """A shot was taken at each of these `bearings` [rad]; the next ones there are others."""
+        self._taken.update(round(bearing, VIEW_DIGITS) for bearing in bearings)
+        self._looks.clear()
 
     def expose(self, exposure_us: float) -> None:
         """Expose so long from the next picture on [us]."""
@@ -132,10 +135,11 @@ class TwinCamera:
 
     def _noise_of(self, bearing: float, laser_on: bool) -> np.random.Generator:
         """The generator for the picture that is taken now."""
-        visit = self._visits[bearing, laser_on]
-        self._visits[bearing, laser_on] += 1
+        bearing = round(bearing, VIEW_DIGITS)
+        look = self._looks[bearing, laser_on]
+        self._looks[bearing, laser_on] += 1
         view = int(np.float64(bearing).view(np.uint64))
-        return np.random.default_rng([self._frames_seed, view, laser_on, visit])
+        return np.random.default_rng([self._frames_seed, view, laser_on, self._taken[bearing], look])
 
     def _rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> F32:
         """Directions (N, 3) in the head frame."""

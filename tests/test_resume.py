@@ -1,0 +1,183 @@
+"""`scan --resume`: the parts of a scan equal one in a single go, or it says why it will not go on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scanmap import config as configuration
+from scanmap import session
+from scanmap.errors import ConfigError, ScanmapError, StageError
+from scanmap.recording import describe, open_source
+from scanmap.session import preparing
+from scanmap.session.rigs import OpenRig, open_rig
+
+QUICK = ("calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=20")
+SWITCH = ("stage.homing='switch'", "twin.drive.switch_deg=-3.0", "stage.home_deg=-2")
+
+
+def scan(folder: Path, *settings: str, shots: int = 1000) -> Path:
+    """Scan the twin, interrupted after about so many shots; its recording."""
+    outputs = session.Outputs((folder / "a.ply",), record=folder / "a.mcap")
+    with session.prepare_scan(session.Choice("twin-quick", (*QUICK, *settings)), outputs, view=False) as job:
+        job.run(lambda _: None, lambda: job.done + 1 >= shots)
+    return folder / "a.mcap"
+
+
+def resume(recording: Path, *settings: str) -> session.Job:
+    outputs = session.Outputs((recording.with_name("b.ply"),))
+    job = session.prepare_scan(session.Choice(settings=settings), outputs, view=False, resume=recording)
+    with job:
+        assert job.run(lambda _: None, lambda: False).ended == "finished"
+    return job
+
+
+def replayed(recording: Path, name: str) -> bytes:
+    outputs = session.Outputs((recording.with_name(name),))
+    with session.prepare_replay(recording, session.Choice(), outputs) as job:
+        job.run(lambda _: None, lambda: False)
+    return recording.with_name(name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        SWITCH,
+        ("sweep.passes='forward-backward'", "sweep.off_frames=true"),
+        ("sweep.mode='adaptive'", "sweep.fine_deg=5", "sweep.step_deg=15"),
+    ],
+    ids=["hand", "switch", "passes", "adaptive"],
+)
+def test_two_parts_equal_one_scan_bit_for_bit(tmp_path: Path, settings: tuple[str, ...]) -> None:
+    (tmp_path / "whole").mkdir()
+    whole = scan(tmp_path / "whole", *settings)
+    first = scan(tmp_path, *settings, shots=4)
+    before = first.read_bytes()
+    there = len(list(open_source(first).shots()))
+    job = resume(first)
+    assert first.read_bytes() == before
+    assert any("homed" in line or "was recognised" in line for line in job.announcement)
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "whole" / "a.ply").read_bytes()
+    assert replayed(first, "c.ply") == (tmp_path / "b.ply").read_bytes()
+    part = tmp_path / "a.part2.mcap"
+    assert [shot.index for shot in open_source(part).shots()] == list(range(there, job.done))
+    times = [shot.time for shot in open_source(first).shots()]
+    assert times == sorted(times)
+    info = describe(first)
+    assert info.shots == job.done and info.end_reason == "finished"
+    assert [shots for _, shots in info.parts] == [there, job.done - there]
+    assert 0 < info.duration_s < describe(whole).duration_s + 10  # the time between the parts does not count
+
+
+def test_shots_lost_to_damage_are_taken_again(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    scan(tmp_path / "whole")
+    first = scan(tmp_path, shots=6)
+    data = bytearray(first.read_bytes())
+    data[data.index(list(open_source(first).shots())[2].image) + 500] ^= 1
+    first.write_bytes(data)
+    resume(first)
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "whole" / "a.ply").read_bytes()
+    assert next(iter(open_source(tmp_path / "a.part2.mcap").shots())).index == 2
+
+
+def test_three_parts_and_a_part_without_a_shot(tmp_path: Path) -> None:
+    first = scan(tmp_path, shots=3)
+    with session.prepare_scan(session.Choice(), session.Outputs(), view=False, resume=first) as job:
+        job.run(lambda _: None, lambda: job.done >= 6)
+    (tmp_path / "a.part3.mcap").write_bytes(first.read_bytes()[:700])
+    job = resume(first)
+    assert job.outputs.record == tmp_path / "a.part4.mcap"
+    source = open_source(first)
+    assert [shot.index for shot in source.shots()] == list(range(10))
+    assert len(source.parts) == 3 and any("part3" in fault for fault in source.faults)
+
+
+def test_a_part_of_another_scan_is_left_out(tmp_path: Path) -> None:
+    first = scan(tmp_path, shots=3)
+    (tmp_path / "other").mkdir()
+    scan(tmp_path / "other", shots=3).rename(tmp_path / "a.part2.mcap")
+    source = open_source(first)
+    assert len(list(source.shots())) == source.count
+    assert any("another scan" in fault for fault in source.faults)
+
+
+def turned(deg: float, monkeypatch: pytest.MonkeyPatch) -> list[OpenRig]:
+    """Let the twin's head stand elsewhere when its board is switched on again; gives the rig when it is opened."""
+    opened: list[OpenRig] = []
+
+    def open_turned(config: configuration.Config, *rest: Any) -> OpenRig:
+        drive = config.twin.drive.model_copy(update={"head_deg": deg})
+        twin = config.twin.model_copy(update={"drive": drive})
+        opened.append(open_rig(config.model_copy(update={"twin": twin}), *rest))
+        return opened[-1]
+
+    monkeypatch.setattr(preparing, "open_rig", open_turned)
+    return opened
+
+
+@pytest.mark.parametrize("deg", [0.35, 23.0, -1.5])
+def test_a_head_left_elsewhere_is_found_by_the_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deg: float
+) -> None:
+    """After a power cut the board believes the head at home, wherever it stands."""
+    first = scan(tmp_path, "sweep.step_deg=4", "sweep.end_deg=48", shots=8)
+    opened = turned(deg, monkeypatch)
+    with session.prepare_scan(session.Choice(), session.Outputs(), view=False, resume=first) as job:
+        assert job.run(lambda _: None, lambda: False).ended == "finished"
+        assert opened[0].twin is not None
+        board = opened[0].twin.firmware
+        off = math.degrees(opened[0].rig.stage.where()) - board.drivetrain.bearing_deg
+        assert abs(off) < 0.15  # where the head is said to stand, and where it stands
+
+
+def test_a_head_that_nothing_recognises_goes_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = scan(tmp_path, "sweep.step_deg=4", shots=12)
+    turned(150.0, monkeypatch)
+    with pytest.raises(StageError, match=r"is not found in .*turn it by hand to 0 deg.*switch or index mark"):
+        resume(first)
+    assert not (tmp_path / "a.part2.mcap").exists()
+
+
+def test_a_room_too_dark_to_be_recognised_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = scan(tmp_path, "twin.room='box'", "twin.light.ambient=0.0", shots=5)
+    turned(50.0, monkeypatch)
+    with pytest.raises(StageError, match=r"too dark or plain to be recognised"):
+        resume(first)
+
+
+REFUSED: list[tuple[Callable[[Path], Path], tuple[str, ...], str]] = [
+    (scan, (), "is complete, 10 shots: scanmap replay"),
+    (lambda folder: scan(folder, "sweep.mode='adaptive'", "sweep.step_deg=90", "sweep.fine_deg=45"), (), "is complete"),
+    (lambda folder: scan(folder, shots=3), ("sweep.step_deg=5",), "goes on with the settings it began with"),
+    (lambda folder: folder / "nothing.mcap", (), "not the recording"),
+    (
+        lambda folder: scan(folder, "sweep.mode='continuous'", "sweep.step_deg=2", "sweep.end_deg=20", shots=5),
+        (),
+        "continuous sweep",
+    ),
+    (lambda folder: scan(folder, shots=3).rename(folder / "a.part2.mcap"), (), "the file that the scan began in"),
+]
+
+
+@pytest.mark.parametrize(("make", "settings", "words"), REFUSED)
+def test_what_cannot_be_gone_on_with_is_refused_and_leaves_nothing(
+    tmp_path: Path, make: Callable[[Path], Path], settings: tuple[str, ...], words: str
+) -> None:
+    recording = make(tmp_path)
+    there = sorted(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match=words):
+        resume(recording, *settings)
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_a_bag_of_others_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from recorded_shots import made_up_shots, record
+
+    with pytest.raises(ScanmapError, match="only scanmap's own"):
+        resume(record(tmp_path / "a.mcap", made_up_shots(3)))
