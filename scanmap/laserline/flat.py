@@ -16,9 +16,9 @@ _WIDE_PX = 1.6  # narrower profiles are blurred too much to have a flat top
 _AT = 0.8  # standard deviations from the middle where a profile is asked; a Gaussian has 0.73 of its height there
 _FLAT = 0.88  # of the height there from which on the top is flat
 _NEARBY = 10  # rows of a run on either side of one that are asked with it
-_LEAST_ROWS = 4
-_ENOUGH_ROWS = 300
-_SURE = 2.0  # standard errors of its mean that a stretch's flatness must exceed
+_LEAST_ROWS, _LEAST_ASKED = 4, 3
+_ENOUGH_ROWS = 700
+_SURE = 3.0  # standard errors of its mean that a stretch's flatness must exceed
 
 
 def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
@@ -53,8 +53,8 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
     stop = np.minimum(index + reach + 1, np.searchsorted(run, run, side="right"))
     rows = stop - first
     mean, square, top, usual, clipped = (total[:, stop] - total[:, first]) / rows
-    scatter = np.sqrt(np.maximum(square - mean * mean, 0.0) / rows)
-    sure = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1) & (rows * step >= _LEAST_ROWS)
+    scatter = np.sqrt(np.maximum(square - mean * mean, 0.0) / np.maximum(rows - 1, 1))
+    sure = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1) & (rows >= _LEAST_ASKED)
     # A row is what the asked ones of its run before and after it are.
     for ask in (np.arange(len(every)) // step, np.minimum(np.arange(len(every)) // step + 1, len(row) - 1)):
         flat[every] |= sure[ask] & (run[ask] == by_run)
