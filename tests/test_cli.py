@@ -531,7 +531,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_in_mid_scan_keeps_everything(run: Run, tmp_path: Path, number: signal.Signals) -> None:
     fine = [word.replace("step_deg=30", "step_deg=0.1") for word in QUICK]
     process = start(tmp_path, "scan", *fine, "--out", "a.ply", "--rrd", "a.rrd")

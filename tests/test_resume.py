@@ -181,3 +181,26 @@ def test_a_bag_of_others_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     with pytest.raises(ScanmapError, match="only scanmap's own"):
         resume(record(tmp_path / "a.mcap", made_up_shots(3)))
+
+
+def test_recover_joins_parts_and_saves_what_a_cut_left(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    scan(tmp_path / "whole")
+    first = scan(tmp_path, shots=6)
+    first.write_bytes(first.read_bytes()[: -len(first.read_bytes()) // 3])
+    resume(first)
+    before = first.read_bytes()
+    lines = session.recover(first)
+    joined = tmp_path / "a.whole.mcap"
+    assert first.read_bytes() == before and lines[0].startswith(f"wrote {joined}: 10 shots")
+    assert any("is cut at byte" in line for line in lines) and "ended: finished" in lines
+    source = open_source(joined)
+    assert list(source.shots()) == list(open_source(first).shots()) and not source.faults
+    assert replayed(joined, "d.ply") == (tmp_path / "whole" / "a.ply").read_bytes()
+    with pytest.raises(ScanmapError, match="exists already"):
+        session.recover(first)
+    with pytest.raises(ScanmapError, match="whole, there is nothing to recover"):
+        session.recover(joined, tmp_path / "e.mcap")
+    assert not (tmp_path / "e.mcap").exists()
+    with pytest.raises(ConfigError, match=r"must end in \.mcap"):
+        session.recover(first, tmp_path / "x.part2.mcap")

@@ -21,6 +21,7 @@ from scanmap.cli import (
     latency,
     live,
     look,
+    recovering,
     scanning,
     settings,
     tabling,
@@ -42,6 +43,7 @@ app.command()(scanning.replay)
 app.command()(look.view)
 app.command("map")(look.make_map)
 app.command()(look.info)
+app.command()(recovering.recover)
 app.command()(settings.config)
 app.command()(live.live)
 app.command()(hardware.doctor)

@@ -13,6 +13,8 @@ from types import FrameType
 
 from rich.console import Console
 
+# A closed terminal sends SIGHUP, which Windows does not know.
+_STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _LOUD_LIBRARIES = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "RUST_LOG": "off"}
 
 
@@ -118,9 +120,9 @@ class Stop:
 
 @contextmanager
 def stop_on_signal() -> Iterator[Stop]:
-    """Take Ctrl-C and SIGTERM; a second one interrupts at once."""
+    """Take Ctrl-C, SIGTERM and a closed terminal; a second one interrupts at once."""
     stop = Stop()
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, stop) for number in _STOPPING}
     try:
         yield stop
     except BaseException as error:

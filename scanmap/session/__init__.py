@@ -19,6 +19,7 @@ from scanmap.session.live_view import open_live_view, watching_words
 from scanmap.session.new_rig import Drive, Head, first_config
 from scanmap.session.outputs import Outputs
 from scanmap.session.preparing import Choice, prepare_replay, prepare_scan
+from scanmap.session.recovering import recover
 from scanmap.session.stage_work import home, jog, switch_laser, where
 from scanmap.view import show
 
@@ -46,6 +47,7 @@ __all__ = [
     "prepare_replay",
     "prepare_scan",
     "prepare_view",
+    "recover",
     "show",
     "show_as_it_is",
     "shown_as_it_is",
