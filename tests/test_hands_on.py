@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_cameras import as_jpeg, noisy, phone
 from test_cli import Run, one_line, run
 from test_hardware_scan import HARDWARE, Head, head
 
@@ -249,6 +250,18 @@ def test_a_first_configuration_names_what_was_found(run: Run, head: Head, attach
     config = configuration.load(str(tmp_path / "my-rig.toml"))
     assert (config.camera.source, config.camera.width, config.stage.port) == (0, 1280, attached)
     assert config.stage.laser == "always-on" and not config.sweep.off_frames
+
+
+def test_a_first_configuration_asks_a_phone_for_its_size(run: Run, nothing_attached: None, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    with phone(lambda: as_jpeg(noisy(rng, size=(320, 240)))) as served:
+        said = run("init", "--out", "a.toml", "--camera", served.url + "/video")
+    assert said.code == 0 and "pictures of 320x240" in said.out
+    config = configuration.load(str(tmp_path / "a.toml"))
+    assert config.head().intrinsics.width == 320 and config.camera.source == served.url + "/video"
+    said = run("init", "--out", "b.toml", "--camera", "7")
+    assert said.code == 0 and "camera 7 cannot be opened" in said.out
+    assert configuration.load(str(tmp_path / "b.toml")).camera.source == 7
 
 
 # live

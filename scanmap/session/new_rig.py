@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from scanmap.config import Config, parse
 from scanmap.errors import CameraError, ConfigError, StageError
-from scanmap.rig.camera import camera_devices
+from scanmap.rig.camera import CameraParams, camera_devices, open_camera
 from scanmap.rig.camera_probe import Mode, probe_modes
 from scanmap.rig.grbl import identify
 from scanmap.rig.serial_port import serial_devices
 from scanmap.rig.stage import StageParams
 
 ENOUGH_HZ = 4.0  # a size that comes slower than this makes scans long
+DEFAULT_SIZE = (1280, 720)
 MOST_PX = 2000  # width; more makes files large and finds the line no better
 
 
@@ -44,7 +46,7 @@ class Found(NamedTuple):
     """What is plugged in; text for people beside it."""
 
     camera: int | str
-    mode: Mode | None
+    size: tuple[int, int]  # of its pictures [px]
     port: str
     lines: list[str]
 
@@ -53,7 +55,7 @@ def look_around() -> Found:
     """The first camera that sends pictures and the first port where a GRBL board answers; `auto` where none is."""
     lines: list[str] = []
     camera: int | str = "auto"
-    mode = None
+    size = DEFAULT_SIZE
     for index, name in camera_devices():
         try:
             modes = probe_modes(index)
@@ -61,7 +63,8 @@ def look_around() -> Found:
             lines.append(str(error))
             continue
         if modes:
-            camera, mode = index, _best(modes)
+            mode = _best(modes)
+            camera, size = index, mode.size
             lines.append(f"camera {index} ({name}): {mode.words}")
             break
     else:
@@ -76,7 +79,7 @@ def look_around() -> Found:
         break
     else:
         lines.append("no GRBL board found: stage.port = 'auto' takes the first one that answers later")
-    return Found(camera, mode, port, lines)
+    return Found(camera, size, port, lines)
 
 
 def first_config(
@@ -91,9 +94,10 @@ def first_config(
         raise ConfigError(f"{path} exists and is not overwritten: choose another --out, or move it away")
     found = look_around()
     yield from found.lines
-    if camera is not None:
-        chosen = int(camera) if camera.isdigit() else camera
-        found = found._replace(camera=chosen, mode=found.mode if chosen == found.camera else None)
+    if camera is not None and (chosen := int(camera) if camera.isdigit() else camera) != found.camera:
+        size, words = _size_of(chosen)
+        yield words
+        found = found._replace(camera=chosen, size=size)
     write_first_config(path, found._replace(port=port or found.port), drive, head, laser=laser)
     name = shlex.quote(str(path))
     yield f"wrote {path}: one degree is {drive.steps_per_deg:g} motor steps"
@@ -110,7 +114,7 @@ def write_first_config(path: Path, found: Found, drive: Drive, head: Head, *, la
     """
     if path.suffix != ".toml":
         raise ConfigError(f"--out {path}: must end in .toml; try {path.with_suffix('.toml')}")
-    size = found.mode.size if found.mode is not None else (1280, 720)
+    size = found.size
     document: dict[str, Any] = {
         "description": "a first configuration: measure the head, then calibrate it",
         "rig": "hardware",
@@ -130,6 +134,16 @@ def write_first_config(path: Path, found: Found, drive: Drive, head: Head, *, la
     except OSError as error:
         raise ConfigError(f"{path} cannot be written ({error.strerror}): choose another --out") from error
     return config
+
+
+def _size_of(source: int | str) -> tuple[tuple[int, int], str]:
+    """Picture size of a camera that was named, from its first picture; and words about it."""
+    try:
+        camera = open_camera(CameraParams(source=source))
+    except (CameraError, ConfigError) as error:
+        return DEFAULT_SIZE, f"{error}; {DEFAULT_SIZE[0]}x{DEFAULT_SIZE[1]} is written for now"
+    with closing(camera):
+        return (camera.width, camera.height), f"camera {source}: pictures of {camera.width}x{camera.height}"
 
 
 def _best(modes: list[Mode]) -> Mode:
