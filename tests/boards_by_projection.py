@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ def bent(xy: Array, k: tuple[float, ...]) -> Array:
 
 def unbent(xy: Array, k: tuple[float, ...]) -> Array:
     found = xy.copy()
-    for _ in range(30):
+    for _ in range(10):
         found = found + xy - bent(found, k)
     return found
 
@@ -125,6 +126,16 @@ def axis_views(
     away: float = 0.5,
 ) -> list[View]:  # fmt: skip
     """One board standing in the room, seen from every bearing (rad) in which all of it is in the picture."""
+    views = []
+    for bearing, T in axis_poses(head, board, bearings, sign=sign, away=away):
+        views.append(view_of(head, board, T, rng, sigma_px, bearing=bearing))
+    return views
+
+
+def axis_poses(
+    head: Head, board: Board, bearings: Array, *, sign: float = 1.0, away: float = 0.5
+) -> list[tuple[float, Array]]:
+    """Bearing and T_camera_board of one board standing in the room, where all of it is in the picture."""
     truth = head.truth()
     mount = truth.mount
     middle = truth.T_head_camera @ np.append(looks(head, np.array(head.c)) * away, 1.0)
@@ -132,13 +143,32 @@ def axis_views(
     R = camera_world[:3, :3] @ rotation_x(0.2) @ rotation_y(-0.3)
     at = (mount.T_world_head(0.0) @ middle)[:3]
     T_world_board = rigid(R, at - R @ board.points.mean(axis=0))
-    views = []
+    found = []
     for bearing in bearings:
         T = inverse(truth.T_head_camera) @ inverse(mount.T_world_head(sign * float(bearing))) @ T_world_board
         pixels = seen(head, board.points @ T[:3, :3].T + T[:3, 3])
         if (pixels > 8).all() and (pixels < np.array([head.width, head.height]) - 9).all() and T[2, 3] > 0:
-            views.append(view_of(head, board, T, rng, sigma_px, bearing=float(bearing)))
-    return views
+            found.append((float(bearing), T))
+    return found
+
+
+def axis_pictures(
+    head: Head, board: Board, bearings: Array, rng: np.random.Generator
+) -> list[tuple[float, NDArray[np.uint8]]]:
+    """Bearing and picture of one board standing in the room."""
+    return [
+        (bearing, picture_of(head, board, T, rng, samples=3))
+        for bearing, T in axis_poses(head, board, bearings, away=0.7)
+    ]
+
+
+def laser_pose(head: Head, board: Board, rng: np.random.Generator) -> Array:
+    """T_camera_board of a board held so that the laser crosses its squares."""
+    while True:
+        T = random_pose(head, board, rng, near=0.35, far=0.9)
+        line = line_of(head, board, T, rng, 0.0, 0.0)
+        if line is not None and len(line.rows) > 100:
+            return T
 
 
 def picture_of(
@@ -162,11 +192,10 @@ def picture_of(
     step = (np.arange(samples) + 0.5) / samples - 0.5
     total = np.zeros((head.height, head.width))
     texture = board_texture(board)
+    rays, per_column, per_row = pixel_rays(head)
     for dv in step:
         for du in step:
-            v, u = np.mgrid[0 : head.height, 0 : head.width].astype(np.float64)
-            rays = looks(head, np.stack([u + du, v + dv], axis=-1))
-            total += texture(_on_board(rays, T))
+            total += texture(_on_board(rays + du * per_column + dv * per_row, T))
     total /= samples**2
     shade = np.linspace(light, 1.0, head.width)[None, :]
     image = 25.0 + 190.0 * total * shade
@@ -210,15 +239,20 @@ def _laser(head: Head, T: Array) -> Array:
     """Brightness (H, W) of a line 1.2 px wide on the board's plane."""
     truth = head.truth()
     plane = truth.T_head_camera.T @ truth.laser_plane
+    rays, per_column, _ = pixel_rays(head)
+
+    def off(looking: Array) -> Array:
+        t = (T[:3, 2] @ T[:3, 3]) / (looking @ T[:3, 2])
+        return (looking * t[..., None]) @ plane[:3] + plane[3]
+
+    rate = off(rays + 0.5 * per_column) - off(rays - 0.5 * per_column)
+    return np.exp(-0.5 * (off(rays) / rate / 1.2) ** 2)
+
+
+@cache
+def pixel_rays(head: Head) -> tuple[Array, Array, Array]:
+    """Rays (H, W, 3) of all pixel centres, and their change by column and by row: straight within a pixel."""
     v, u = np.mgrid[0 : head.height, 0 : head.width].astype(np.float64)
-    light = np.zeros((head.height, head.width))
-
-    def off(columns: Array) -> Array:
-        rays = looks(head, np.stack([columns, v], axis=-1))
-        t = (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])
-        return (rays * t[..., None]) @ plane[:3] + plane[3]
-
-    here = off(u)
-    rate = off(u + 0.5) - off(u - 0.5)
-    light[:] = np.exp(-0.5 * (here / rate / 1.2) ** 2)
-    return light
+    at = np.stack([u, v], axis=-1)
+    near = [looks(head, at + np.array(by)) for by in ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))]
+    return near[0], near[1] - near[2], near[3] - near[4]

@@ -92,7 +92,7 @@ def calibrate_axis(views: Sequence[View], board: Board, calibration: Calibration
             )
         _require(good)
     fit = AxisFit(
-        _mount(solved.x, calibration), solved.covariance, _slope_by_intrinsics(good, board, calibration, solved.x),
+        _mount(solved.x, calibration), solved.covariance, _slope_by_intrinsics(good, board, calibration, solved),
         good, solved.residuals, rejected, _span_deg(good), turn,
     )  # fmt: skip
     return _checked(fit, calibration)
@@ -112,6 +112,7 @@ class _Solved(NamedTuple):
     x: Array  # (10,) SOLVED, then rotation vector and position of the board in the axis frame
     residuals: list[Array]
     covariance: Array  # (4, 4)
+    jacobian: Array  # of all residuals by x
 
 
 def _require(views: Sequence[View]) -> None:
@@ -260,16 +261,21 @@ def _solve(views: Sequence[View], board: Board, calibration: Calibration, start:
     variance = float(found.fun @ found.fun) / max(1, count - 10)
     scale = np.linalg.norm(J, axis=0)
     covariance = variance * np.linalg.pinv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
-    return _Solved(found.x, _residuals(found.x, views, board, calibration), covariance[:4, :4])
+    return _Solved(found.x, _residuals(found.x, views, board, calibration), covariance[:4, :4], J)
 
 
-def _slope_by_intrinsics(views: Sequence[View], board: Board, calibration: Calibration, x: Array) -> Array:
+def _slope_by_intrinsics(views: Sequence[View], board: Board, calibration: Calibration, solved: _Solved) -> Array:
+    """Derivative (4, 9) of SOLVED by the intrinsics. Source: implicit function theorem at the least squares minimum."""
     own = calibration.intrinsics
     steps = [1e-3 * own.fx, 1e-3 * own.fy, 1e-3 * own.fx, 1e-3 * own.fx, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2]
-    slope = np.zeros((4, 9))
+    change = np.zeros((len(solved.jacobian), 9))
     for k, (name, step) in enumerate(zip(INTRINSICS, steps, strict=True)):
-        both = [_solve(views, board, moved(calibration, [name], np.array([by])), x).x[:4] for by in (-step, step)]
-        slope[:, k] = (both[1] - both[0]) / (2.0 * step)
+        both = [
+            np.concatenate([r.ravel() for r in _residuals(solved.x, views, board, moved(calibration, [name], by))])
+            for by in (np.array([-step]), np.array([step]))
+        ]
+        change[:, k] = (both[1] - both[0]) / (2.0 * step)
+    slope: Array = np.asarray(-np.linalg.lstsq(solved.jacobian, change, rcond=None)[0][:4], np.float64)
     return slope
 
 

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # A view counts from this share of the board's corners, and from this many.
-LEAST_SHARE, LEAST_CORNERS = 0.25, 12
+LEAST_SHARE, LEAST_CORNERS = 0.25, 8
 # [px] a corner may move when it is refined; one that moves further was none.
 MOVED_MOST_PX = 2.0
 # [10 to 90 % of an edge, as a share of a square] beyond it corners are no longer found evenly.
@@ -55,8 +55,10 @@ def find_board(image: Image, board: Board, name: str = "", bearing: float = floa
     spacing = _spacing(board, ids, corners)
     if spacing < 5.0:
         return Rejected(name, f"squares of {spacing:.1f} px are too small to measure; come closer")
-    refined, moved = _refined(grey, corners, spacing)
-    contrast, blur = _edges(grey, refined, spacing)
+    # The gradients of a marker beside a corner are not the corner's.
+    clear = 0.5 * (1.0 - board.marker_m / board.square_m) if board.kind == "charuco" else 1.0
+    refined, moved = _refined(grey, corners, min(0.3, clear) * spacing)
+    contrast, blur = _edges(grey, refined, spacing, _across_edges(board, ids, corners))
     keep = (moved < MOVED_MOST_PX) & (contrast > CONTRAST_LEAST * np.median(contrast))
     keep &= (refined >= 2).all(axis=1) & (refined < np.array(grey.shape[::-1]) - 3).all(axis=1)
     if blur > max(4.0, BLUR_MOST * spacing):
@@ -162,20 +164,32 @@ def _spacing(board: Board, ids: Index, corners: Array) -> float:
     return float(known.min()) if known.size else 0.0
 
 
-def _refined(grey: Image, corners: Array, spacing: float) -> tuple[Array, Array]:
+def _refined(grey: Image, corners: Array, reach: float) -> tuple[Array, Array]:
     """Corners (N, 2) to sub-pixel, where the gradients around stand across the way there; and how far they went.
 
     Source: Foerstner and Guelch 1987, OpenCV's cornerSubPix.
     """
-    half = int(np.clip(0.3 * spacing, 2, 12))
+    half = int(np.clip(reach, 2, 12))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     found = cv2.cornerSubPix(grey, corners.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), criteria)
     refined = np.asarray(found, np.float64).reshape(-1, 2)
     return refined, np.linalg.norm(refined - corners, axis=1)
 
 
-def _edges(grey: Image, corners: Array, spacing: float) -> tuple[Array, float]:
-    """Contrast (N,) around each corner [grey levels], and the median width of an edge, 10 to 90 % [px]."""
+def _across_edges(board: Board, ids: Index, corners: Array) -> Array:
+    """Unit vectors (2, 2) in the picture across the edges along the columns and along the rows."""
+    flat = board.points[ids, :2]
+    along = np.linalg.lstsq(np.c_[flat, np.ones(len(flat))], corners, rcond=None)[0][:2]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    unit: Array = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    return unit
+
+
+def _edges(grey: Image, corners: Array, spacing: float, across: Array) -> tuple[Array, float]:
+    """Contrast (N,) around each corner [grey levels], and the median width of an edge, 10 to 90 % [px].
+
+    Of the two directions of edges, `across` (2, 2), the more blurred one: a hand shakes one way.
+    """
     half = int(np.clip(0.4 * spacing, 3, 25))
     height, width = grey.shape
     contrast, widths = np.zeros(len(corners)), []
@@ -186,8 +200,9 @@ def _edges(grey: Image, corners: Array, spacing: float) -> tuple[Array, float]:
         low, high = np.percentile(patch, [8, 92])
         contrast[k] = high - low
         smooth = cv2.GaussianBlur(patch.astype(np.float32), (0, 0), 0.7)
-        slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8)
-        widths.append(0.8 * contrast[k] / max(float(np.percentile(slope, 97)), 1e-3))
+        gradient = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], axis=-1) / 8
+        slope = np.percentile(np.abs(gradient.reshape(-1, 2) @ across.T), 97, axis=0).min()
+        widths.append(0.8 * contrast[k] / max(float(slope), 1e-3))
     return contrast, float(np.median(widths)) if widths else np.inf
 
 

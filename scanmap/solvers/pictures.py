@@ -22,7 +22,7 @@ from scanmap.solvers.detection import Rejected, View, find_board, seen_instead
 # Of a video without bearings this many pictures are taken, evenly.
 VIDEO_PICTURES = 120
 # [share] by which markers may measure larger or smaller against their squares than they should.
-RATIO_MOST = 0.05
+RATIO_MOST = 0.08
 
 
 class Picture(NamedTuple):
