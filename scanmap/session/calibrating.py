@@ -59,7 +59,9 @@ class BoardJob:
 
     @property
     def is_live(self) -> bool:
-        """Whether a camera delivers the pictures."""
+        """Whether a camera delivers the pictures; a folder or file of that name goes first."""
+        if not self.source.startswith("/dev/") and Path(self.source).exists():
+            return False
         if self.source == LIVE or "://" in self.source:
             return True
         return self.source.startswith("/dev/") or self.source.isdecimal()
@@ -137,6 +139,10 @@ def solve_axis(job: BoardJob, base: Calibration) -> Solved:
     Raises:
         CalibrationError: see `calibrate_axis`.
     """
+    if "laser plane" in base.meta.get("uncalibrated", ()):
+        raise CalibrationError(
+            "the head's frame hangs on its laser plane, which is not calibrated yet: scanmap calibrate laser comes first"
+        )
     kept = _Kept()
     views = collect(_pictures(job, turning=True), job.board, use=kept.keep, report=job.report)
     views.require()
