@@ -45,6 +45,8 @@ _WEAK_PX, _STANDS_OUT = 0.2, (2.5, 4.5)
 _BLOCKS_ROWS = 18
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
+# What may be wrong of a core's place, as a share of its width, however smooth the line of cores is.
+_CORE_BIAS = 0.03
 # Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
 # the sigmas to be believed, and may fall below them once they are known to be wrong.
 _APART_ROWS, _MORE, _LESS = (5, 6), 1.08, 0.5
@@ -221,7 +223,22 @@ def _take_cores(
     beside = np.minimum(y[:, :3].mean(axis=1), y[:, -3:].mean(axis=1))
     line.peak[r] = np.maximum(cores.contrast, y.max(axis=1) - beside)[sharp]
     line.width_px[r] = cores.width_px[sharp]
-    line.sigma_px[r], line.reason[r] = cores.sigma_px[sharp], Reason.OK
+    line.sigma_px[r], line.reason[r] = (
+        _borne_out(line.column_px, r, cores.sigma_px[sharp], cores.width_px[sharp]),
+        Reason.OK,
+    )
+
+
+def _borne_out(column: Array, row: Index, sigma: F32, width: F32) -> Array:
+    """Sigmas (N,) of cores, which are guesses from their width, brought down to what they scatter along the line.
+
+    A halo that is stronger on one side moves all of them alike: a part of the width always remains.
+    """
+    columns, sigmas = (np.full(len(column), np.nan) for _ in range(2))
+    columns[row], sigmas[row] = column[row], sigma
+    factor = unexplained(columns, sigmas, segments(columns, sigmas)[0], _APART_ROWS)
+    least = np.minimum(_CORE_BIAS * width, sigma)
+    return np.asarray(np.maximum(min(factor, 1.0) * sigma, least), np.float64)
 
 
 def _take_bars(line: LaserLine, plane: U8, lit: U8 | None, noise: float, params: LaserLineParams) -> None:
