@@ -141,7 +141,8 @@ def solve_axis(job: BoardJob, base: Calibration) -> Solved:
     """
     if "laser plane" in base.meta.get("uncalibrated", ()):
         raise CalibrationError(
-            "the head's frame hangs on its laser plane, which is not calibrated yet: scanmap calibrate laser comes first"
+            "the head's frame hangs on its laser plane, which is not calibrated yet: "
+            "scanmap calibrate laser comes first"
         )
     kept = _Kept()
     views = collect(_pictures(job, turning=True), job.board, use=kept.keep, report=job.report)
