@@ -12,7 +12,7 @@ U8 = NDArray[np.uint8]
 
 SATURATED = 250  # [grey levels] from here on a sample says only "bright"
 # Pairs of rows that the laser's colour is measured on: more where few do not tell; and what does, in grey levels.
-_COLOUR_PAIRS = (8, 32)
+_COLOUR_PAIRS = (4, 12, 32)
 _CLEAR_RATIO, _CLEAR = 2.5, 15.0
 _NARROW_PX, _BRIGHT_PX = (5, 160), (16, 40)  # distance of a line's sides: at least, and as a part of the width
 _BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
@@ -47,6 +47,9 @@ def judged_channel(image: U8) -> tuple[int, bool]:
         strength = [float(rising[n // 2 :].mean()) for rising in best]
         second, first = sorted(strength)[1:]
         clear = first > max(_CLEAR_RATIO * second, _CLEAR)
+        if pairs == _COLOUR_PAIRS[0]:
+            # So few must agree, nearly all of them.
+            clear &= bool(best[int(np.argmax(strength))][n // 4] > max(_CLEAR_RATIO * second, _CLEAR))
         if clear:
             break
     # A grey picture in three channels has no lead at all: then the brightest line counts.
