@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.noise import dot, noise_variance, speckle_contrast
+from scanmap.laserline.samples import ends, levelled
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -22,6 +23,7 @@ _SPECKLE_REACH = 5.0  # [sigma] under speckle the flanks say more than the core
 _SPECKLE_ROWS = 31  # rows over which the line's height is smoothed for a first model of its speckle
 _OFF_MOST = 1.2  # [px] from the middle of the window, and
 _NARROW_PX, _WIDEST = 0.75, 6.2  # the widths, the wider as a part of the window, at which sums are integrals
+_MOSTLY = 0.75  # share of the rows that lack samples, from which on all are fitted as they are
 _STRAY = 0.01  # share of the rows that is not worth another kind of step
 _DIM = 11.0  # heights, in noise, from whose first guess the way is too long for that
 _ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
@@ -69,12 +71,13 @@ def fit_gaussian(
     cut = np.flatnonzero(usable.min(axis=0) < 1)  # rows with samples that say little
     clipped = np.zeros(y.shape[1], bool)
     clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
-    y = _levelled(y, x, sample_noise)
+    y = levelled(y, x, sample_noise)
     fit = start = _start(y, x)
-    for _ in range(_ITERATIONS):
+    mostly_cut = len(cut) > _MOSTLY * y.shape[1]
+    for _ in range(0 if mostly_cut else _ITERATIONS):
         fit = _improve_whole(x, _Look(y, x, fit), fit)
     odd = (np.abs(fit.u) > _OFF_MOST) | (fit.s < _NARROW_PX) | (fit.s > n / _WIDEST) | (_DIM * sample_noise > fit.A)
-    odd[cut] = True
+    odd[slice(None) if mostly_cut else cut] = True
     part = np.flatnonzero(odd)
     # What is left of a clipped line needs more of its background to be told four parameters from.
     least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
@@ -91,7 +94,7 @@ def fit_gaussian(
         if samples is not None:
             y, usable = samples(n // 2 + n // 4)
             x = (np.arange(len(y), dtype=np.float32) - len(y) // 2)[:, None]
-            y = _levelled(y, x, sample_noise)
+            y = levelled(y, x, sample_noise)
         fit, weight = _fit_speckle(y, x, usable, fit, sample_noise, contrast)
         look = _Look(y, x, fit)
         look.weight = weight
@@ -160,37 +163,9 @@ class _Look:
         self.weight = (np.abs(self.z) <= reach).astype(np.float32)
 
 
-def _levelled(y: F32, x: F32, sample_noise: float) -> F32:
-    """Windows with the ramp between their two ends taken out, where it is more than noise.
-
-    A line beside an edge of the room's own brightness would be fitted too wide. Everywhere else a ramp as a fifth
-    parameter would cost a fifth of the accuracy.
-    """
-    left, right = _ends(y)
-    ramp = right - left
-    height = y.max(axis=0) - np.maximum(left, right)
-    least = np.float32(4.5 * sample_noise * np.sqrt(2.0 / _end(y)))
-    steep = np.flatnonzero(np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height))
-    if steep.size:
-        y[:, steep] -= ramp[steep] * (x / np.float32(len(x) - _end(y)))
-    return y
-
-
-def _end(y: F32) -> int:
-    return max(2, len(y) // 6)
-
-
-def _ends(y: F32) -> tuple[F32, F32]:
-    """Means (N,) of the samples at the two ends of the windows."""
-    k = _end(y)
-    if k == 2:
-        return (y[0] + y[1]) * np.float32(0.5), (y[-1] + y[-2]) * np.float32(0.5)
-    return y[:k].mean(axis=0), y[-k:].mean(axis=0)
-
-
 def _start(y: F32, x: F32) -> _Fit:
     """First guess: background from the window's ends, width from area over height."""
-    b = np.minimum(*_ends(y))
+    b = np.minimum(*ends(y))
     above = y - b
     A = np.maximum(above.max(axis=0), np.float32(1.0))
     above *= above > np.float32(0.25) * A
