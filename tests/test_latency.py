@@ -103,6 +103,7 @@ def test_the_twins_latency_is_found_by_sweeps(twin: OpenRig) -> None:
     assert said == ["sweeping forward and backward at 6 deg/s"]
 
 
+@pytest.mark.slow  # the quick suite blinks in `doctor`
 def test_the_twins_latency_is_found_by_blinking_and_the_laser_is_off_afterwards(twin: OpenRig) -> None:
     found, contrast = latency_by_blinks(twin, lambda _: None)
     assert found.latency_s == pytest.approx(0.08, abs=0.004)
