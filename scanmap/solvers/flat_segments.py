@@ -23,6 +23,8 @@ TILE_ROWS = 5
 TILE_TURN = np.radians(4.0)
 # The smallest flat piece: patches, bearings, rows of patches.
 SMALLEST = (30, 3, 6)
+# Pieces that turn against each other by more than this meet in a corner, and are not parts of one wall.
+CORNER = np.radians(15.0)
 
 
 class Segments(NamedTuple):
@@ -78,6 +80,22 @@ def beside(points: Array, per_column: Array, plane: Array) -> Array:
     return columns
 
 
+def near_another(points: Array, per_column: Array, segments: Segments, reach_px: float) -> Mask:
+    """Patches (B, R) of a piece that another piece's plane, at an angle to their own, holds for too: along the corners.
+
+    They may lie on either surface, and taken for the wrong one they bend it.
+    """
+    shot, row = np.nonzero(segments.label >= 0)
+    own = segments.planes[segments.label[shot, row], :3]
+    p, slope = points[shot, row], per_column[shot, row]
+    close = np.zeros(len(shot), bool)
+    for plane in segments.planes:
+        close |= (np.abs(own @ plane[:3]) < np.cos(CORNER)) & (np.abs(beside(p, slope, plane)) < reach_px)
+    near = np.zeros(segments.label.shape, bool)
+    near[shot, row] = close
+    return near
+
+
 def fitted_plane(points: Array, per_column: Array, normal: Array | None = None, rounds: int = 1) -> Array:
     """Plane (4,) through points (N, 3), weighted by what a column means along the normal."""
     weight = np.ones(len(points))
@@ -109,6 +127,8 @@ def _tiles(points: Array, per_column: Array, known: Mask, step: float) -> list[_
     j = np.arange(0, rows - TILE_ROWS + 1, max(1, TILE_ROWS // 2))
     at = (i[:, None, None, None] + np.arange(wide)[:, None], j[None, :, None, None] + np.arange(TILE_ROWS))
     some = np.argwhere(known[at].mean(axis=(2, 3)) >= 0.7)
+    if not len(some):
+        return []
     tile_shot = i[some[:, 0], None, None] + np.arange(wide)[:, None]
     tile_row = j[some[:, 1], None, None] + np.arange(TILE_ROWS)
     shot, row = (axis.reshape(len(some), -1) for axis in np.broadcast_arrays(tile_shot, tile_row))

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import PLANE, Uncertainty, uncertainty_of
 from scanmap.errors import CalibrationError
-from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, grow
+from scanmap.solvers.flat_segments import Segments, grow, near_another
 from scanmap.solvers.freedom import FREE, RULER, Scale, changed, longer_length, plane_slope, redrawn
+from scanmap.solvers.own_planes import beside_own_planes, leans
 from scanmap.solvers.sight import Lines, Patches, Sight, located, patches_of, sight_of
 
 Array = NDArray[np.float64]
@@ -100,7 +101,8 @@ def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *
                 f"only {len(segments)} flat pieces found (3 at least): point the scanner at walls, floor and furniture "
                 "with flat faces, or calibrate with a board: scanmap calibrate laser"
             )
-        problem = _Problem.of(sight, segments, calibration, free, ruler)
+        clear = ~near_another(points, per_column, segments, 2.0 * tolerance)
+        problem = _Problem.of(sight, (segments, clear), calibration, free, ruler)
         change, covariance = problem.solve(change)
         tolerance = max(0.5 * tolerance, min(5.0 * segments.noise_px, tolerance))
     return _judged(_Outcome(calibration, scale, free, ruler, change, covariance), problem, segments, patches, any_gain)
@@ -110,50 +112,57 @@ def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *
 class _Problem:
     """The patches of one round, sorted by the piece they lie on."""
 
-    residual: Callable[[Array], tuple[Array, Array]]  # change (P,) -> (N,) [px], and leans (M,) in units of PLUMB
+    # Change (P,) and weights (N,) of the planes' fits -> (N,) [px], and leans (M,) in units of PLUMB.
+    residual: Callable[[Array, Array], tuple[Array, Array]]
     piece: NDArray[np.intp]  # (N,) ascending
     cluster: NDArray[np.intp]  # (N,) one shot on one piece: what may share an error
     ruler: Array  # (P,)
+    weight: Array  # (N,) of the last solution
 
     @classmethod
     def of(
-        cls, sight: Sight, segments: Segments, calibration: Calibration, free: tuple[str, ...], ruler: Array
-    ) -> _Problem:
-        where = np.flatnonzero(segments.label.ravel() >= 0)
+        cls, sight: Sight, found: tuple[Segments, NDArray[np.bool_]], calibration: Calibration, free: tuple[str, ...],
+        ruler: Array,
+    ) -> _Problem:  # fmt: skip
+        segments, clear = found
+        where = np.flatnonzero(((segments.label >= 0) & clear).ravel())
         where = where[:: max(1, len(where) // LARGEST_SOLVE)]
         where = where[np.argsort(segments.label.ravel()[where], kind="stable")]
-        found, piece = np.unique(segments.label.ravel()[where], return_inverse=True)
+        numbers, piece = np.unique(segments.label.ravel()[where], return_inverse=True)
         shot = where // segments.label.shape[1]
         _, cluster = np.unique(piece * segments.label.shape[0] + shot, return_inverse=True)
         flat = Sight(*(part.reshape(-1, *part.shape[2:])[where] for part in sight))
-        first, normals = np.searchsorted(piece, np.arange(len(found))), segments.planes[found, :3]
+        first, normals = np.searchsorted(piece, np.arange(len(numbers))), segments.planes[numbers, :3]
         large = np.argsort(-np.bincount(piece))[:LARGEST_PIECES]
         lean = np.abs(normals[large, 2])
         walls, floors = large[lean < np.sin(UPRIGHT_WITHIN)], large[lean > np.cos(UPRIGHT_WITHIN)]
 
-        def residual(change: Array) -> tuple[Array, Array]:
+        def residual(change: Array, weight: Array) -> tuple[Array, Array]:
             points, per_column = located(flat, changed(calibration, free, change))
-            off, now = _beside_own_planes(points, per_column, piece, first, normals)
+            off, now = beside_own_planes(points, per_column, weight, (piece, first, normals))
             now = now * np.copysign(1.0, (now * normals).sum(axis=1))[:, None]
-            return off, _leans(now[walls], now[floors]) / PLUMB
+            return off, leans(now[walls], now[floors]) / PLUMB
 
-        return cls(residual, piece, cluster, ruler)
+        return cls(residual, piece, cluster, ruler, np.ones(len(piece)))
 
     def solve(self, change: Array) -> tuple[Array, Array]:
         """The best change (P,) and its covariance, reweighted three times."""
         from scipy.optimize import least_squares
 
-        for _ in range(3):
-            off, lean = self.residual(change)
-            root, steady = np.sqrt(self._weights(off)), 1.0 / np.sqrt(1.0 + (lean / 2.0) ** 2)
+        weight = np.ones(len(self.piece))
+        for _ in range(4):
+            off, lean = self.residual(change, weight)
+            weight = self._weights(off)
+            steady = 1.0 / np.sqrt(1.0 + (lean / 2.0) ** 2)
 
-            def weighed(x: Array, root: Array = root, steady: Array = steady) -> Array:
-                off, lean = self.residual(x)
-                return np.concatenate([off * root, lean * steady, x / self.ruler])
+            def weighed(x: Array, weight: Array = weight, steady: Array = steady) -> Array:
+                off, lean = self.residual(x, weight)
+                return np.concatenate([off * np.sqrt(weight), lean * steady, x / self.ruler])
 
             solution = least_squares(weighed, change, x_scale=self.ruler, max_nfev=12)
             change = solution.x
         covariance: Array = np.linalg.inv(solution.jac.T @ solution.jac)
+        self.weight[:] = weight
         return change, covariance
 
     def _weights(self, off: Array) -> Array:
@@ -200,41 +209,6 @@ class _Outcome:
     covariance: Array
 
 
-def _beside_own_planes(
-    points: Array, per_column: Array, piece: NDArray[np.intp], first: NDArray[np.intp], normals: Array
-) -> tuple[Array, Array]:
-    """Columns (N,) that points lie beside the planes fitted through each piece's own, and those planes' normals."""
-    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column)
-    for _ in range(2):
-        along = (per_column * normals[piece]).sum(axis=1)
-        weight = 1.0 / np.maximum(np.abs(along), FLOOR_M_PER_PX) ** 2
-        centre = np.add.reduceat(points * weight[:, None], first) / np.add.reduceat(weight, first)[:, None]
-        q = points - centre[piece]
-        moments = np.add.reduceat(q[:, :, None] * q[:, None, :] * weight[:, None, None], first)
-        normals = np.linalg.eigh(moments)[1][:, :, 0]
-    along = (per_column * normals[piece]).sum(axis=1)
-    steep = np.where(along >= 0, 1.0, -1.0) * np.maximum(np.abs(along), FLOOR_M_PER_PX)
-    off: Array = (q * normals[piece]).sum(axis=1) / steep
-    return off, normals
-
-
-def _leans(wall: Array, floor: Array) -> Array:
-    """How far walls are from upright and floors from level [rad], (M,), beside what the axis leans as a whole.
-
-    Args:
-        wall, floor: normals (., 3). With up = (x, y, 1), small, a wall has n . up = 0 and a floor n parallel to up.
-    """
-    tilt = floor[:, :2] / floor[:, 2:]
-    rows = np.concatenate([wall[:, :2], np.tile([1.0, 0.0], (len(floor), 1)), np.tile([0.0, 1.0], (len(floor), 1))])
-    lean = np.concatenate([-wall[:, 2], tilt[:, 0], tilt[:, 1]])
-    if len(lean) < 3:
-        return np.zeros(0)
-    # The axis is plumb to some degrees at least: a weak row for each direction keeps two parallel walls solvable.
-    up = np.linalg.solve(rows.T @ rows + 0.01 * np.eye(2), rows.T @ lean)
-    left: Array = lean - rows @ up
-    return left
-
-
 def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: Patches, any_gain: bool) -> Refined:
     """The result, or why there is none."""
     sigma = np.sqrt(np.diag(outcome.covariance))
@@ -255,7 +229,9 @@ def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: P
             f"self-calibration would change {', '.join(far)} far more than a ruler errs: the head is not the one of "
             "this calibration, or the scan has hardly a flat wall. Calibrate with a board; nothing is written"
         )
-    before, after = (_rms(problem.residual(x)[0]) for x in (np.zeros(len(outcome.change)), outcome.change))
+    before, after = (
+        _rms(problem.residual(x, problem.weight)[0]) for x in (np.zeros(len(outcome.change)), outcome.change)
+    )
     if not after <= before and not any_gain:
         raise CalibrationError(
             f"nothing to gain: flat pieces deviate by {before:.3f} px as it is and {after:.3f} px after; nothing is "
