@@ -596,6 +596,15 @@ def test_overlay_made_smaller_still_shows_every_row(factor: int) -> None:
     assert (picture[~is_green] == 250).all()
 
 
+def test_a_wide_overlay_is_three_pixels_wide_and_nothing_else_changes() -> None:
+    """In a pane half as wide as the picture a single pixel beside a saturated line is lost."""
+    grey = np.full((H, W), 250, np.uint8)
+    picture = painted(grey, np.full(H, 50.2), "red", 1, wide=True)
+    expected = np.full((H, W, 3), 250, np.uint8)
+    expected[:, 49:52] = (0, 0, 255)
+    np.testing.assert_array_equal(picture, expected)
+
+
 @pytest.mark.parametrize("shape", [(24, 40), (24, 40, 3)])
 def test_jpeg_gives_the_picture_back(shape: tuple[int, ...]) -> None:
     image = np.full(shape, 90, np.uint8)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+PANE_PX = 400  # of four pictures side by side in a window none is much wider
 ROW_COLOUR = (255, 210, 60, 150)
 
 _MODELS = {
@@ -81,12 +82,13 @@ class ThesisView:
 
     def _pictures(self, image: Image, column_px: Array) -> dict[str, Picture]:
         quality, k = self._params.jpeg_quality, self._shrink
+        wide = image.shape[1] / k > PANE_PX
         grey = to_grey(image, self._laserline.grey, self._laserline.bit_index)
         return {
             at.THESIS_ORIGINAL: jpeg(shrunk(image, k), quality),
             at.THESIS_GREY: jpeg(shrunk(grey, k), quality),
             at.THESIS_BINARY: png(shrunk_lines(binary_image(grey), k)),
-            at.THESIS_OVERLAY: jpeg(painted(grey, column_px, self._params.overlay_colour, k), quality),
+            at.THESIS_OVERLAY: jpeg(painted(grey, column_px, self._params.overlay_colour, k, wide=wide), quality),
         }
 
     def _log_constant(self) -> None:
@@ -128,13 +130,15 @@ def _with_models(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]
     return calibration, tuple(name for name, there in has.items() if there)
 
 
-def painted(grey: Image, column_px: Array, colour: Literal["red", "green", "blue"], factor: int) -> Image:
+def painted(
+    grey: Image, column_px: Array, colour: Literal["red", "green", "blue"], factor: int, *, wide: bool = False
+) -> Image:
     """The overlay (T7), BGR, made smaller by `factor`.
 
-    Where it is made smaller the line is three pixels wide: a single one beside a saturated line would vanish in
-    a window that is smaller still.
+    Where it is made smaller, or `wide` asks for it, the line is three pixels wide: a single one beside a saturated
+    line would vanish in a window that is smaller still.
     """
-    if factor == 1:
+    if factor == 1 and not wide:
         return overlay(grey, column_px, colour)
     line = shrunk_lines(overlay(np.zeros_like(grey), column_px, colour), factor)
     line = np.asarray(cv2.dilate(line, np.ones((1, 3), np.uint8)), np.uint8)
