@@ -126,6 +126,14 @@ def test_a_camera_lost_in_mid_scan_keeps_what_was_scanned(head: Head, choice: se
     assert not head.board.laser_on and not head.board.motor_on
 
 
+def test_exposures_that_nobody_can_set_are_refused_before_anything_opens(head: Head) -> None:
+    settings = (*HARDWARE, "camera.source=http://phone/video", "sweep.exposures_us=[1000, 2000]")
+    config = configuration.load("twin-room", settings)
+    with pytest.raises(ConfigError, match=r"exposures_us needs a USB webcam"):
+        open_rig(config, config.head())
+    assert head.device.opened == 0
+
+
 def test_replay_only_is_no_rig() -> None:
     config = configuration.load("srv-turntable")
     with pytest.raises(ConfigError, match=r"replay-only.*hardware"):

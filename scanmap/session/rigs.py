@@ -92,8 +92,14 @@ def open_hardware(config: Config, size: tuple[int, int] | None, ask: Callable[[s
         size: width and height [px] to ask the camera for, where `[camera]` names none.
 
     Raises:
+        ConfigError: the sweep asks for what this camera cannot do.
         CameraError, StageError: the device is missing, or does not do what it should.
     """
+    if config.sweep.exposures_us and config.camera.kind != "device":
+        raise ConfigError(
+            f"sweep.exposures_us needs a USB webcam: nobody can set the exposure of camera.source = "
+            f"{config.camera.source!r} from here; leave it empty"
+        )
     with ExitStack() as opened:
         camera = open_camera(config.camera, size)
         opened.callback(camera.close)
