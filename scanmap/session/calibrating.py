@@ -16,7 +16,7 @@ from scanmap.calibration.file import R_HEAD_CAMERA_FORWARD
 from scanmap.calibration.gates import GATES
 from scanmap.calibration.keeping import save_beside
 from scanmap.config import Config
-from scanmap.errors import CalibrationError, ConfigError
+from scanmap.errors import CalibrationError, CameraError, ConfigError
 from scanmap.geometry import rigid
 from scanmap.rig.camera import open_camera
 from scanmap.session.rigs import open_rig
@@ -260,7 +260,7 @@ def _turning(config: Config) -> Iterator[Picture | Rejected]:
         opened.close()
 
 
-def _live(config: Config, *, laser: bool) -> Iterator[Picture]:
+def _live(config: Config, *, laser: bool) -> Iterator[Picture | Rejected]:
     """Pictures as the camera sends them, until nobody asks for more; the laser lit where the rig can."""
     with ExitStack() as opened:
         if laser and config.rig == "hardware":
@@ -273,7 +273,15 @@ def _live(config: Config, *, laser: bool) -> Iterator[Picture]:
             opened.callback(camera.close)
         number = 0
         while True:
-            yield Picture(f"picture {number}", decode_image(camera.grab().image).image)
+            try:
+                frame = camera.grab()
+            except CameraError as error:
+                if not number:
+                    raise
+                # What was collected before the camera went is not lost.
+                yield Rejected("the camera", f"{error}; going on with the pictures so far")
+                return
+            yield Picture(f"picture {number}", decode_image(frame.image).image)
             number += 1
 
 

@@ -62,7 +62,8 @@ def hints(views: Sequence[View], poses: Array, size: tuple[int, int]) -> list[st
     """What to show next, most needed first; empty when there is enough."""
     wanted = []
     if len(views) < VIEWS_GOOD:
-        wanted.append(f"{VIEWS_GOOD - len(views)} more views")
+        missing = VIEWS_GOOD - len(views)
+        wanted.append("1 more view" if missing == 1 else f"{missing} more views")
     if tilt_spread_deg(poses) < TILT_GOOD_DEG:
         wanted.append("tilt the board more, 20 to 40 deg up, down, left and right")
     if coverage_of(views, size).share < COVERED_GOOD:

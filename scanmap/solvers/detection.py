@@ -18,6 +18,8 @@ Index = NDArray[np.intp]
 LEAST_SHARE, LEAST_CORNERS = 0.25, 8
 # [px] a corner may move when it is refined; one that moves further was none.
 MOVED_MOST_PX = 2.0
+# [px] a chessboard is looked for in pictures of about this size, at a glance and thoroughly.
+LOOKED_AT_PX, THOROUGHLY_PX = 1600, 800
 # [10 to 90 % of an edge, as a share of a square] beyond it corners are no longer found evenly.
 BLUR_MOST = 0.3
 # Of the board's median contrast: a corner with less lies in glare, in a shadow or under a finger.
@@ -98,19 +100,26 @@ def seen_instead(image: Image, board: Board) -> str:
 
 
 def _chessboard(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
+    """A quick look at once, then a thorough one at a smaller picture: on clutter it costs a hundred times as much."""
     across, down = board.corners
-    sweeps = (cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
-    for flags in sweeps:
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (across, down), flags | cv2.CALIB_CB_LARGER)
-        if not found:
+    looks = (
+        (LOOKED_AT_PX, cv2.CALIB_CB_NORMALIZE_IMAGE),
+        (THOROUGHLY_PX, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
+    )
+    for size, flags in looks:
+        factor = max(1, round(max(grey.shape) / size))
+        less = (
+            cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA) if factor > 1 else grey
+        )
+        seen, corners, meta = cv2.findChessboardCornersSBWithMeta(less, (across, down), flags | cv2.CALIB_CB_LARGER)
+        if not seen:
             continue
         if meta is not None and {int(meta.shape[1]), int(meta.shape[0])} != {across, down}:
             return f"a chessboard of {meta.shape[1]}x{meta.shape[0]} inner corners is in sight, not {across}x{down}"
         if (int(meta.shape[1]), int(meta.shape[0])) == (across, down):
-            return np.arange(across * down), _right_handed(corners, across, down), np.nan
-    found, corners = cv2.findChessboardCorners(grey, (across, down))
-    if found:
-        return np.arange(across * down), _right_handed(corners, across, down), np.nan
+            # A pixel of the smaller picture is the mean of a block.
+            whole = (np.asarray(corners, np.float64) + 0.5) * factor - 0.5
+            return np.arange(across * down), _right_handed(whole, across, down), np.nan
     return "no board found"
 
 

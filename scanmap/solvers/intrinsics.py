@@ -193,3 +193,17 @@ def describe_fit(fit: CameraFit, say: Callable[[str], None]) -> None:
     terms = zip(INTRINSICS[4:], own.distortion, strict=True)
     say(", ".join(f"{name} {value:.4f} +- {sure.sigma(name):.4f}" for name, value in terms))
     say(f"boards tilted within {fit.tilt_deg:.0f} deg, corners in {100 * fit.covered:.0f} % of the picture")
+    for wish in hints(fit.views, fit.poses, (own.width, own.height)):
+        say(f"better still: {wish}")
+    lost = _share_without_ray(own)
+    if lost > 0:
+        say(
+            f"warning: in {100 * lost:.1f} % of the picture, at its rim, the distortion is not known and nothing "
+            "can be measured: hold the board there too"
+        )
+
+
+def _share_without_ray(own: Intrinsics) -> float:
+    """Share of the picture where the distortion polynomial folds over, as it does where no corner held it."""
+    u, v = np.meshgrid(np.linspace(0, own.width - 1, 41), np.linspace(0, own.height - 1, 31))
+    return float(np.isnan(own.rays(u.ravel(), v.ravel())[:, 0]).mean())

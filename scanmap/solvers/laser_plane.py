@@ -78,7 +78,7 @@ def fit_laser_plane(lines: Sequence[BoardLine], board: Board, intrinsics: Intrin
     bound = ODD_PX * max(1.0, intrinsics.width / 1600.0)
     good, rejected = list(range(len(lines))), list[Rejected]()
     while True:
-        plane, A, gradients = _refined(start, [clouds[k] for k in good])
+        plane, normal, gradients = _refined(start, [clouds[k] for k in good])
         median = [float(np.median(np.abs(_off_px(plane, clouds[k])))) for k in good]
         worst = int(np.argmax(median))
         # A board that says the same as the others, only less well, stays.
@@ -97,7 +97,8 @@ def fit_laser_plane(lines: Sequence[BoardLine], board: Board, intrinsics: Intrin
     _require_lines(len(good), f" after {len(rejected)} that contradict the others")
     chosen = [clouds[k] for k in good]
     fit = LaserFit(
-        plane, _sandwich(plane, A, gradients), _slope_by_intrinsics(plane, [lines[k] for k in good], board, intrinsics),
+        plane, _sandwich(plane, normal, gradients),
+        _slope_by_intrinsics(plane, [lines[k] for k in good], board, intrinsics),
         [lines[k] for k in good], [p for p, _ in chosen], [p @ plane[:3] + plane[3] for p, _ in chosen],
         [_off_px(plane, cloud) for cloud in chosen], rejected,
     )  # fmt: skip
@@ -213,7 +214,7 @@ def _consensus(clouds: Sequence[tuple[Array, Array]], width: int) -> Array:
 
 
 def _refined(start: Array, clouds: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Plane (4,), normal matrix (3, 3) and each board's gradient (V, 3) in the tangent of the plane."""
+    """Plane (4,), each board's normal matrix (V, 3, 3) and gradient (V, 3) in the tangent of the plane."""
     points = np.concatenate([p for p, _ in clouds])
     per_px = np.concatenate([d for _, d in clouds])
     board = np.repeat(np.arange(len(clouds)), [len(p) for p, _ in clouds])
@@ -233,7 +234,9 @@ def _refined(start: Array, clouds: Sequence[tuple[Array, Array]]) -> tuple[Array
             break
     gradients = np.zeros((len(clouds), 3))
     np.add.at(gradients, board, J * (weight * off)[:, None])
-    return plane, A, gradients
+    normal = np.zeros((len(clouds), 3, 3))
+    np.add.at(normal, board, (J * weight[:, None])[:, :, None] * J[:, None, :])
+    return plane, normal, gradients
 
 
 def _tangent(plane: Array) -> Array:
@@ -245,11 +248,19 @@ def _tangent(plane: Array) -> Array:
     return basis
 
 
-def _sandwich(plane: Array, A: Array, gradients: Array) -> Array:
-    """(4, 4) covariance with each board as one measurement. Source: Liang and Zeger, Biometrika 1986."""
+def _sandwich(plane: Array, normal: Array, gradients: Array) -> Array:
+    """(4, 4) covariance with each board as one measurement.
+
+    A board far from the others draws the plane to itself and hides its own error, so every board counts as far off as
+    it would be from the plane of the others alone.
+
+    Source: Bell and McCaffrey, "Bias reduction in standard errors for linear regression", 2002 (the jackknife form).
+    """
     count = len(gradients)
-    inverse_A = np.linalg.pinv(A)
-    inner = inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 3)
+    inverse_A = np.linalg.pinv(normal.sum(axis=0))
+    apart = np.array([np.linalg.pinv(np.eye(3) - of_board @ inverse_A) for of_board in normal])
+    alone = np.einsum("vij,vj->vi", apart, gradients)
+    inner = inverse_A @ (alone.T @ alone) @ inverse_A * (count - 1) / count
     basis = _tangent(plane)
     covariance: Array = basis @ inner @ basis.T
     return covariance
