@@ -43,17 +43,18 @@ def test_bent_walls_give_offset_and_beta_back(beta: float, offset: tuple[float, 
     assert all(e.observed for e in refined.estimates)
 
 
+@pytest.mark.slow
 def test_stated_sigma_is_the_spread() -> None:
     """Offsets and beta over some seeds, in units of the deviation that each run states."""
     ratios = []
-    for seed in range(2):
+    for seed in range(6):
         refined = refine(room_lines(0.03, seed), head(), any_gain=True)
         beta, offset, _ = errors(refined, head())
         off = {"yaw": np.radians(beta), "offset_x": offset[0] / 1e3, "offset_y": offset[1] / 1e3}
         ratios += [off[name] / refined.estimate(name).sigma for name in off]
         known = uncertainty_of(refined.after)
         assert known is not None and known.sigma("offset_x") == pytest.approx(refined.estimate("offset_x").sigma)
-    assert 0.15 < np.sqrt(np.mean(np.square(ratios))) < 1.8
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.8
 
 
 def test_on_a_turntable_the_axis_holds_the_scale() -> None:

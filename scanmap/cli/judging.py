@@ -86,8 +86,8 @@ def check(
     Example: scanmap calibrate check room.mcap --figure walls.png
     """
     from scanmap.cli.terminal import say
-    from scanmap.solvers.check import CheckParams
     from scanmap.solvers.check import check as judge
+    from scanmap.solvers.walls import CheckParams
 
     _check_figure(figure)
     measured, _ = _measure(recording, config, set_, calibration)
@@ -132,7 +132,7 @@ def _measure(
     from scanmap.session.judging import measure_lines
 
     choice = session.Choice(config, tuple(set_ or ()), calibration)
-    with stop_on_signal() as stop, session.prepare_replay(recording, choice, session.Outputs()) as job:
+    with stop_on_signal() as stop, session.prepare_replay(recording, choice, session.Outputs(), gated=False) as job:
         for line in job.announcement:
             say(line)
         with progress_bar("reading", job.total) as progress:

@@ -110,7 +110,13 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool, resume: Path |
 
 
 def prepare_replay(
-    path: Path, choice: Choice, outputs: Outputs, *, bearings: Path | None = None, view: bool = False
+    path: Path,
+    choice: Choice,
+    outputs: Outputs,
+    *,
+    bearings: Path | None = None,
+    view: bool = False,
+    gated: bool = True,
 ) -> Job:
     """Open a recording, a folder of frames or a video for replay.
 
@@ -119,6 +125,7 @@ def prepare_replay(
 
     Args:
         bearings: csv of a video's bearings, where it is not beside it.
+        gated: refuse a calibration that states a residual over its gate; not where it is to be judged or refined.
 
     Raises:
         ConfigError, CalibrationError, RecordingError: before anything is processed.
@@ -132,7 +139,8 @@ def prepare_replay(
     if view:
         require_display(INSTEAD_OF_VIEW)
     head = choice.head() or (config.head() if config.calibration is not None else source.calibration())
-    check_residuals(head)
+    if gated:
+        check_residuals(head)
     job = Job(
         config=config,
         calibration=head,

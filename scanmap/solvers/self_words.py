@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from scanmap.calibration import Calibration
-from scanmap.solvers.check import CheckParams, Wall, walls_under
 from scanmap.solvers.self_calibration import Estimate, Refined
 from scanmap.solvers.sight import Lines
+from scanmap.solvers.walls import CheckParams, Wall, walls_under
 
 SHOWN_WALLS = 6
 
