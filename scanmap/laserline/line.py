@@ -20,7 +20,7 @@ from scanmap.laserline.grey import Grey, exposure_gain, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
-from scanmap.laserline.pooling import pool, segments, unexplained
+from scanmap.laserline.pooling import TELLING, pool, segments, unexplained
 from scanmap.laserline.result import LaserLine, Reason, no_line, without
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import search
@@ -48,8 +48,9 @@ _CORE_SHARE, _CORE_HALF = 0.4, 13
 # What may be wrong of a core's place, as a share of its width, however smooth the line of cores is.
 _CORE_BIAS = 0.03
 # Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
-# the sigmas to be believed, and may fall below them once they are known to be wrong.
-_APART_ROWS, _MORE, _LESS = (5, 6), 1.08, 0.5
+# the sigmas to be believed, and may fall below them once they are known to be wrong; what is beyond the last is the
+# surface's own.
+_APART_ROWS, _MORE, _LESS, _MOST = (5, 6), 1.08, 0.5, 4.0
 
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
@@ -154,7 +155,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
 def _pooled(line: LaserLine, rows: int) -> LaserLine:
     """The line with sigmas that the scatter along it bears out, and pooled over so many rows (3 or more)."""
     parts = segments(line.column_px, line.sigma_px)
-    more = unexplained(line.column_px, line.sigma_px, parts[0], _APART_ROWS)
+    more = min(unexplained(line.column_px, line.sigma_px, parts[0], _APART_ROWS), _MOST)
     correlated = more > _MORE
     if correlated:
         line.sigma_px[:] *= more
@@ -165,7 +166,7 @@ def _pooled(line: LaserLine, rows: int) -> LaserLine:
     # Errors that are alike in neighbouring rows do not average out as others do.
     more = unexplained(pooled, sigma, parts[0], (rows + 1,))
     if correlated or more > _MORE:
-        sigma *= max(more, _LESS)
+        sigma *= min(max(more, _LESS), _MOST)
     return line._replace(column_px=pooled, sigma_px=sigma)
 
 
@@ -234,6 +235,8 @@ def _borne_out(column: Array, row: Index, sigma: F32, width: F32) -> Array:
 
     A halo that is stronger on one side moves all of them alike: a part of the width always remains.
     """
+    if len(row) < TELLING:
+        return sigma.astype(np.float64)
     columns, sigmas = (np.full(len(column), np.nan) for _ in range(2))
     columns[row], sigmas[row] = column[row], sigma
     factor = unexplained(columns, sigmas, segments(columns, sigmas)[0], _APART_ROWS)

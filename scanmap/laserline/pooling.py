@@ -16,7 +16,7 @@ _MISFIT = 4.5
 # Chi^2 of a bend that is kept by half; share of a bend's variance that remains when nothing of it is kept.
 _BEND_DOUBT, _BEND_LEAST = 2.0, 0.5
 
-_TELLING = 75  # rows that tell whether sigma is too small
+TELLING = 75  # rows that tell whether sigma is too small
 
 
 def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] | None = None) -> tuple[Array, Array]:
@@ -70,7 +70,7 @@ def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
         if len(column) <= span:
             return 1.0
         at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))[::2]
-        if len(at) < _TELLING:
+        if len(at) < TELLING:
             return 1.0
         a, b, c, d, e = (column[at + k * lag] for k in range(5))
         va, vb, vc, vd, ve = (variance[at + k * lag] for k in range(5))
