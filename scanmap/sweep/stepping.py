@@ -18,6 +18,8 @@ from scanmap.sweep.watching import Doubt, Watch
 
 STILL_RAD = math.radians(0.01)  # a head that stands is reported at one place
 FAR_RAD = math.radians(50.0)  # from there everything looks different
+NEVER_LIT_SHOTS = 5
+NEVER_LIT = f"no laser line in any of the first {NEVER_LIT_SHOTS} shots: is the laser on, the room within reach?"
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +67,7 @@ class Steps:
         self._sleep = sleep
         self._watch = watch
         self._rehomings_left = planned.params.rehomings
+        self._seen: tuple[bytes, float] = (b"", 0.0)  # the last picture, and where it was taken
         self._exposure_us: float | None = None  # as last asked for
 
     def shots(self, stop: Callable[[], bool], refine: Refine | None, done: Collection[int]) -> Iterator[Shot]:
@@ -89,6 +92,9 @@ class Steps:
             shot = self._confirmed(self.shoot(index, bearing))
             if self._watch is not None:
                 self._watch.trust(shot)
+                if self._watch.never_lit == NEVER_LIT_SHOTS:
+                    logger.warning(NEVER_LIT)
+                    self._note(NEVER_LIT)
             yield shot
 
     def shoot(self, index: int, bearing: float) -> Shot:
@@ -104,6 +110,7 @@ class Steps:
                     self._sleep(self._params.settle_s)
                 self._expose(index)
                 frame, background = self._take()
+                self._check_alive(frame.image, background, reported)
                 after = self._rig.stage.where()
                 if abs(after - reported) > STILL_RAD:
                     raise StageError(
@@ -191,6 +198,15 @@ class Steps:
         if wanted is not None and wanted != self._exposure_us:
             expose(self._rig.camera, wanted)
             self._exposure_us = wanted
+
+    def _check_alive(self, image: bytes, background: bytes | None, bearing: float) -> None:
+        """Raise CameraError where a picture is, to the last bit, one from elsewhere or with the laser off."""
+        before, self._seen = self._seen, (image, bearing)
+        if image == background or (image == before[0] and abs(bearing - before[1]) > STILL_RAD):
+            raise CameraError(
+                "the camera sends the same picture again and again: it is frozen, plug it in anew; `scanmap doctor` "
+                "shows what it delivers, scanmap scan --resume goes on"
+            )
 
     def _take(self) -> tuple[Frame, bytes | None]:
         """A frame with the laser on and, if asked for and possible, one with it off, taken just before."""

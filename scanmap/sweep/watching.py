@@ -47,6 +47,7 @@ class Watch:
         self._alarms = dict.fromkeys(Doubt, 0)
         self.first: Shot | None = None
         self.last: Shot | None = None  # whose bearing and laser are trusted
+        self.never_lit = 0  # shots since the beginning, as long as none showed a line
         self.dark = False  # whether going without a line was looked into already
 
     def overlap(self, shift: Shift) -> bool:
@@ -59,6 +60,7 @@ class Watch:
         if self._lit is not None:
             lit = self._share(shot)
             self.dark = lit < LIT_NOW
+            self.never_lit = self.never_lit + 1 if self.dark and not self._lit_before else 0
             self._lit_before = self._lit_before if self.dark else lit
         self.last = shot
 

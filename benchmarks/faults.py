@@ -1,0 +1,252 @@
+"""Every fault at random moments of a scan: noticed when, what was lost, is the laser off, does a resumed scan equal?
+
+    python benchmarks/faults.py [--moments 20] [--homing hand|switch] [FAULT ...]
+
+Small pictures, few bearings, a board in fast-forward; seeded. Writes the table of docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import logging
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanmap import session
+from scanmap.errors import CameraError, ScanmapError
+from scanmap.recording import open_source
+from scanmap.scan.formats import read_ply
+from scanmap.session import preparing
+from scanmap.session.rigs import OpenRig, TwinDevices, open_rig
+from scanmap.shot import Shot
+from scanmap.sweep.matching import same_line, shift_between
+
+SETTINGS = (
+    "calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=8", "sweep.end_deg=80",
+    "sweep.off_frames=true", "stage.timeout_s=0.3", "recording.min_free_mb=0",
+)  # fmt: skip
+HOMING = {"hand": (), "switch": ("stage.homing='switch'", "twin.drive.switch_deg=-3.0", "stage.home_deg=-2")}
+
+
+@dataclass
+class Scene:
+    """What a fault can lay hands on."""
+
+    twin: TwinDevices
+    job: session.Job
+
+
+Fault = Callable[[Scene], None]
+
+
+def _no_camera(scene: Scene, times: int = 1 << 30) -> None:
+    grab, left = scene.twin.camera.grab, [times]
+
+    def broken() -> Any:
+        left[0] -= 1
+        if left[0] < 0:
+            return grab()
+        raise CameraError("the camera is gone")
+
+    scene.twin.camera.grab = broken  # type: ignore[method-assign]
+
+
+def _frozen(scene: Scene) -> None:
+    frame = scene.twin.camera.grab()
+    scene.twin.camera.grab = lambda: frame  # type: ignore[method-assign]
+
+
+class _Disk:
+    """Stands before a recording's file: slow, or full after some bytes."""
+
+    def __init__(self, file: Any, room: float, delay_s: float) -> None:
+        self._file, self._room, self._delay_s = file, room, delay_s
+
+    def write(self, data: Any) -> int:
+        time.sleep(self._delay_s)
+        if len(data) > self._room:
+            self._file.write(data[: int(self._room)])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._room -= len(data)
+        return int(self._file.write(data))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def _disk(scene: Scene, room: float, delay_s: float = 0.0) -> None:
+    assert scene.job.recorder is not None
+    file = scene.job.recorder._file
+    file._raw = _Disk(file._raw, room, delay_s)
+
+
+def _set(name: str, value: object) -> Fault:
+    return lambda scene: setattr(scene.twin.firmware.faults, name, value)
+
+
+FAULTS: dict[str, Fault] = {
+    "camera unplugged": _no_camera,
+    "two bad frames": lambda scene: _no_camera(scene, 2),
+    "camera frozen": _frozen,
+    "stage unplugged": _set("unplugged", True),
+    "board hangs": _set("mute", True),
+    "brown-out": lambda scene: scene.twin.firmware.power_cycle(),
+    "limit switch": lambda scene: scene.twin.firmware.trip_limit(),
+    "4 deg of steps lost": lambda scene: scene.twin.firmware.drivetrain.slip(320),
+    "motor stalled": lambda scene: setattr(scene.twin.firmware.drivetrain, "stalled", True),
+    "laser dead": lambda scene: setattr(scene.twin.firmware, "laser_dead", True),
+    "lost ok": _set("lose_ok", 1),
+    "lost line": _set("lose_lines", 1),
+    "lost status": _set("lose_status", 2),
+    "garbage": _set("garbage", bytes(range(256))),
+    "slow disk": lambda scene: _disk(scene, math.inf, 0.02),
+    "full disk": lambda scene: _disk(scene, 3000.0),
+}
+
+
+@dataclass
+class Tally:
+    """What became of the scans that one fault was put into."""
+
+    runs: int = 0
+    overcome: int = 0  # scans that finished in spite of it
+    after: list[int] = field(default_factory=list)  # shots recorded between fault and end
+    lost: int = 0  # shots recorded and not readable
+    wrong: int = 0  # shots recorded that show another place, or no line
+    shining: int = 0  # scans after which the laser shines
+    equal: int = 0  # of the scans, finished or resumed, that equal an undisturbed one
+    words: set[str] = field(default_factory=set)
+
+    def row(self, name: str) -> str:
+        stopped = self.runs - self.overcome
+        after = f"{max(self.after)}" if self.after else "-"
+        return (
+            f"| {name} | {self.overcome} / {stopped} | {after} | {self.lost} | {self.wrong} | "
+            f"{self.runs - self.shining} / {self.runs} | {self.equal} / {self.runs} |"
+        )
+
+
+def scan(folder: Path, homing: str, resume: Path | None = None, fault: Fault | None = None, moment: int = -1) -> Any:
+    """One scan; gives (result or None, error, writes to the board, shots recorded at the fault, laser shines)."""
+    writes, at_fault = [0], [-1]
+    opened: list[OpenRig] = []
+
+    def sabotaged(*words: Any) -> OpenRig:
+        opened.append(open_rig(*words))
+        return opened[-1]
+
+    preparing.open_rig = sabotaged  # type: ignore[assignment]
+    record = None if resume is not None else folder / "a.mcap"
+    outputs = session.Outputs((folder / ("b.ply" if resume else "a.ply"),), record=record)
+    choice = session.Choice() if resume is not None else session.Choice("twin-quick", (*SETTINGS, *HOMING[homing]))
+    result, error = None, None
+    try:
+        with session.prepare_scan(choice, outputs, view=False, resume=resume) as job:
+            twin = opened[0].twin
+            assert twin is not None
+            board, plain = twin.firmware, twin.firmware.write
+
+            def write(data: bytes) -> None:
+                writes[0] += 1
+                if writes[0] == moment and fault is not None and job.recorder is not None:
+                    at_fault[0] = job.recorder.shots
+                    fault(Scene(twin, job))
+                plain(data)
+
+            board.write = write  # type: ignore[method-assign]
+            result = job.run(lambda _: None, lambda: False)
+            error = result.error
+    except (ScanmapError, OSError) as raised:
+        error = raised
+    return result, error, writes[0], at_fault[0], bool(opened) and opened[0].twin.firmware.laser_on  # type: ignore[union-attr]
+
+
+def is_elsewhere(shot: Shot, clean: Shot) -> bool:
+    """Whether a recorded picture shows another place than it should, or no line; noise may differ."""
+    if shot.image == clean.image:
+        return False
+    shift = shift_between(clean.background or clean.image, shot.background or shot.image)
+    return not same_line(clean.image, shot.image) or (shift.is_sure and shift.is_proved)
+
+
+def is_same(cloud: Path, clean: Path) -> bool:
+    """Whether a scan has every bearing and, but for the noise of pictures taken again, the points of another."""
+    if not cloud.exists():
+        return False
+    one, other = read_ply(cloud), read_ply(clean)
+    if not np.array_equal(one.bearings, other.bearings):
+        return False
+    apart = np.abs(one.range_m - other.range_m) / np.hypot(one.sigma_m, other.sigma_m)
+    both = one.valid & other.valid
+    return bool(both.sum() > 0.97 * other.valid.sum() and (apart[both] < 6.0).mean() > 0.97)
+
+
+def campaign(name: str, homing: str, moments: int, clean: Path, writes: int, rng: np.random.Generator) -> Tally:
+    """One fault at so many moments."""
+    whole = {shot.index: shot for shot in open_source(clean / "a.mcap").shots()}
+    tally = Tally()
+    for moment in rng.integers(1, writes + 1, moments):
+        with tempfile.TemporaryDirectory() as text:
+            folder = Path(text)
+            result, error, _, at_fault, shining = scan(folder, homing, fault=FAULTS[name], moment=int(moment))
+            if at_fault < 0:
+                continue
+            tally.runs += 1
+            tally.shining += shining
+            recording = folder / "a.mcap"
+            shots = list(open_source(recording).shots()) if recording.exists() else []
+            tally.wrong += sum(is_elsewhere(shot, whole[shot.index]) for shot in shots)
+            if error is None:
+                tally.overcome += 1
+                assert result is not None
+                tally.lost += result.shots - len(shots)
+                tally.equal += is_same(folder / "a.ply", clean / "a.ply")
+                continue
+            tally.words.add(str(error))
+            tally.after.append(len(shots) - at_fault)
+            tally.lost += max(0, at_fault - len(shots))
+            again = folder / "b.ply"
+            if not shots:
+                recording.unlink(missing_ok=True)
+                _, error, *_ = scan(folder, homing)
+                again = folder / "a.ply"
+            elif len(shots) == len(whole):
+                again = folder / "a.ply"
+            else:
+                _, error, *_ = scan(folder, homing, resume=recording)
+            tally.equal += is_same(again, clean / "a.ply")
+    return tally
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("faults", nargs="*", metavar="FAULT", help=", ".join(FAULTS))
+    parser.add_argument("--moments", type=int, default=20)
+    parser.add_argument("--homing", choices=list(HOMING), default="hand")
+    parser.add_argument("--words", action="store_true", help="print every message")
+    options = parser.parse_args()
+    logging.disable(logging.WARNING)
+    print("| fault | overcome / stopped | noticed after (shots) | lost | wrong | laser off | equal |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as text:
+        clean = Path(text)
+        _, error, writes, *_ = scan(clean, options.homing)
+        assert error is None, error
+        for name in options.faults or FAULTS:
+            rng = np.random.default_rng(sum(map(ord, name)))
+            tally = campaign(name, options.homing, options.moments, clean, writes, rng)
+            print(tally.row(name), flush=True)
+            for words in sorted(tally.words) if options.words else ():
+                print("    ", words)
+
+
+if __name__ == "__main__":
+    main()
