@@ -14,7 +14,10 @@ SATURATED = 250  # [grey levels] from here on a sample says only "bright"
 # Pairs of rows that the laser's colour is measured on: more where few do not tell; and what does, in grey levels.
 _COLOUR_PAIRS = (4, 12, 32)
 _CLEAR_RATIO, _CLEAR = 2.5, 15.0
+# Blue line lasers are rare, and what is blue in a room without any is not: they must stand out twice as much.
+_USUAL = (0.5, 1.0, 1.0)
 _NARROW_PX, _BRIGHT_PX = (5, 160), (16, 40)  # distance of a line's sides: at least, and as a part of the width
+_LEADS, _NEARLY = 2, 230  # [grey levels] that a channel must lead the others by, and from which on it need not
 _BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
 _MANY = 0.3  # share of the rows
 
@@ -44,7 +47,7 @@ def judged_channel(image: U8) -> tuple[int, bool]:
         upper, lower = _by_colour(planes).reshape(3, 2, n, -1).swapaxes(0, 1).reshape(2, 3 * n, -1)
         both = np.asarray(cv2.min(upper, cv2.dilate(lower, np.ones((1, 5), np.uint8))), np.uint8)
         best = np.sort(both.max(axis=1).reshape(3, n), axis=1)
-        strength = [float(rising[n // 2 :].mean()) for rising in best]
+        strength = [rare * float(rising[n // 2 :].mean()) for rare, rising in zip(_USUAL, best, strict=True)]
         second, first = sorted(strength)[1:]
         clear = first > max(_CLEAR_RATIO * second, _CLEAR)
         if pairs == _COLOUR_PAIRS[0]:
@@ -83,7 +86,10 @@ def _rise(own: U8, others: NDArray[np.generic], white: U8) -> U8:
         away = max(_BRIGHT_PX[0], width // _BRIGHT_PX[1])
         wide = cv2.min(_lesser(own, lead, white, away, 2 * away + 1), clipped)
         rise = np.asarray(cv2.max(rise, wide), np.uint8)
-    return rise
+    # White between red stripes rises in green, and in green's lead too; but it is not green.
+    leads = cv2.threshold(lead, 128 + _LEADS // 2, 255, cv2.THRESH_BINARY)[1]
+    bright = cv2.threshold(own, _NEARLY - 1, 255, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.min(rise, cv2.max(leads, bright)), np.uint8)
 
 
 def _lesser(own: U8, lead: U8, white: U8, away: int, around: int) -> U8:
