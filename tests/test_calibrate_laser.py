@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from boards_by_projection import Head, line_of, picture_of, random_pose, seen
+from boards_by_projection import Head, line_of, picture_of, random_pose, seen, view_of
 
 from scanmap import config as configuration
 from scanmap.calibration import Calibration, check_residuals, moved, uncertainty_of
@@ -18,6 +18,7 @@ from scanmap.session.calibrating import BoardJob, check_laser, solve_camera, sol
 from scanmap.solvers.board import parse_board
 from scanmap.solvers.board_line import BoardLine, find_board_line, points_on_board
 from scanmap.solvers.detection import Rejected, find_board
+from scanmap.solvers.intrinsics import calibrate_camera
 from scanmap.solvers.laser_plane import fit_laser_plane, head_frame_of, plane_in_camera, with_laser_plane
 
 BOARD = parse_board("chessboard:9x6:30mm")
@@ -43,9 +44,12 @@ def ranges(calibration: Calibration, distances: tuple[float, ...]) -> list[float
     along = TRUTH.laser_plane[:3]
     points -= (points @ along + TRUTH.laser_plane[3])[:, None] * along
     T = np.linalg.inv(TRUTH.T_head_camera)
-    pixels = seen(HEAD, points @ T[:3, :3].T + T[:3, 3])
+    points_cam = points @ T[:3, :3].T + T[:3, 3]
+    pixels = seen(HEAD, points_cam)
     found = locate(pixels[:, 0], pixels[:, 1], calibration, TriangulationParams())[0]
-    return [float(r) for r in np.linalg.norm(found, axis=1) / np.linalg.norm(points, axis=1)]
+    # From the camera, which every head frame knows.
+    away = np.linalg.norm(found - calibration.T_head_camera[:3, 3], axis=1)
+    return [float(r) for r in away / np.linalg.norm(points_cam, axis=1)]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,6 +91,32 @@ def test_the_camera_uncertainty_enters_the_plane_with_its_correlation() -> None:
     at = [b.names.index("cx"), b.names.index("plane_nx")]
     correlation = b.matrix[at[0], at[1]] / (b.sigma("cx") * b.sigma("plane_nx"))
     assert abs(correlation) > 0.5
+
+
+@pytest.mark.parametrize("keep_head", [True, False])
+def test_ranges_through_the_whole_chain_are_as_good_as_stated(keep_head: bool) -> None:
+    rng = np.random.default_rng(11)
+    views = [view_of(HEAD, BOARD, random_pose(HEAD, BOARD, rng, near=0.3, far=0.7), rng, 0.05) for _ in range(20)]
+    camera = calibrate_camera(views, BOARD, (HEAD.width, HEAD.height))
+    base = replace(TRUTH, intrinsics=camera.intrinsics, covariance=camera.uncertainty.table())
+    some = lines(12)
+    # A normal may come out either way round; what is stated must not depend on it.
+    for sign in (1.0, -1.0):
+        fit = fit_laser_plane(some, BOARD, camera.intrinsics)
+        fit = fit._replace(plane=sign * fit.plane, slope=sign * fit.slope)
+        made = with_laser_plane(base, fit, keep_head=keep_head)
+        known = uncertainty_of(made)
+        assert known is not None
+        slope = np.zeros((2, len(known.names)))
+        for k, name in enumerate(known.names):
+            step = np.array([0.05 * known.sigma(name) + 1e-12])
+            ahead, behind = (ranges(moved(made, [name], by), (1.0, 3.0)) for by in (step, -step))
+            slope[:, k] = (np.array(ahead) - np.array(behind)) / (2 * step)
+        stated = np.sqrt(np.diag(slope @ known.matrix @ slope.T))
+        # Camera and plane err together; taken as independent they would state ten times as much.
+        assert (stated < [3e-4, 6e-4]).all()
+        off = np.array(ranges(made, (1.0, 3.0))) - 1.0
+        assert (np.abs(off) < np.minimum(4.0 * stated + 1e-4, [1e-3, 2e-3])).all()
 
 
 def test_the_head_frame_of_the_thesis_is_the_thesis() -> None:

@@ -116,7 +116,8 @@ def with_laser_plane(calibration: Calibration, fit: LaserFit, *, keep_head: bool
     T = calibration.T_head_camera if keep_head else head_frame_of(fit.plane)
     carry = inverse(T).T  # takes plane coordinates from the camera to the head frame
     plane = carry @ fit.plane
-    side = 1.0 if not keep_head or plane[:3] @ calibration.laser_plane[:3] >= 0 else -1.0
+    before = calibration.laser_plane if keep_head else np.array([0.0, 1.0, 0.0, 0.0])
+    side = 1.0 if plane[:3] @ before[:3] >= 0 else -1.0
     known = uncertainty_of(calibration) or Uncertainty((), np.zeros((0, 0)))
     known = known.without(() if keep_head else [name for name in known.names if name not in INTRINSICS])
     slope = np.zeros((4, len(known.names)))
@@ -124,9 +125,7 @@ def with_laser_plane(calibration: Calibration, fit: LaserFit, *, keep_head: bool
         if name in INTRINSICS:
             slope[:, k] = side * carry @ fit.slope[:, INTRINSICS.index(name)]
     joined = known.joined(PLANE, carry @ fit.covariance @ carry.T, slope)
-    plane = side * plane / np.linalg.norm(plane[:3])
-    if not keep_head:
-        plane = np.array([0.0, 1.0, 0.0, 0.0])
+    plane = side * plane / np.linalg.norm(plane[:3]) if keep_head else before
     mount = calibration.mount if keep_head else type(calibration.mount)()
     return replace(calibration, T_head_camera=T, laser_plane=plane, mount=mount, covariance=joined.table())
 
