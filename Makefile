@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: scan test test-slow test-hardware check bench demo lock dist clean
+.PHONY: scan test test-slow test-hardware fuzz check bench demo lock dist clean
 
 # A fresh machine needs python >= 3.11 with pip and venv, and make; nothing else, no root.
 $(VENV)/.installed: pyproject.toml
@@ -26,6 +26,10 @@ test-slow: $(VENV)/.installed-dev
 
 test-hardware: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m hardware
+
+# 100,000 inputs in all.
+fuzz: $(VENV)/.installed-dev
+	FUZZ_EXAMPLES=20000 $(BIN)/python -m pytest tests/test_fuzz.py
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

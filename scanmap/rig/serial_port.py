@@ -113,11 +113,20 @@ def open_serial(url: str, baud: int) -> SerialPort:
 
     try:
         port = serial.serial_for_url(
-            url, baudrate=baud, timeout=0.02, write_timeout=2.0, exclusive=None if "://" in url else True
+            url,
+            baudrate=baud,
+            timeout=0.02,
+            write_timeout=write_timeout_s(url),
+            exclusive=None if "://" in url else True,
         )
     except (OSError, ValueError) as error:
         raise StageError(_why_not_open(url, error)) from error
     return SerialPort(port, url)
+
+
+def write_timeout_s(url: str) -> float | None:
+    """How long a write may take [s]; pyserial's RFC 2217 client refuses to open with any limit."""
+    return None if url.startswith("rfc2217://") else 2.0
 
 
 def serial_devices() -> list[str]:

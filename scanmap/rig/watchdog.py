@@ -50,10 +50,12 @@ def watch(url: str, baud: int) -> None:
         return
     import serial
 
+    from scanmap.rig.serial_port import write_timeout_s
+
     deadline = time.monotonic() + OPEN_S
     while time.monotonic() < deadline:
         try:
-            with serial.serial_for_url(url, baudrate=baud, write_timeout=2.0) as port:
+            with serial.serial_for_url(url, baudrate=baud, write_timeout=write_timeout_s(url)) as port:
                 port.write(HOLD)
                 time.sleep(BRAKE_S)
                 port.write(RESET)

@@ -1,0 +1,45 @@
+"""Scan after scan in fast-forward, as in a day and a night: nothing piles up."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from scanmap import session
+
+QUICK = (
+    "calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=20", "sweep.end_deg=40",
+    "twin.room='box'",
+)  # fmt: skip
+
+
+def held() -> tuple[int, int, int]:
+    """Memory [kB], threads, file handles of this process."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return (
+        pages * os.sysconf("SC_PAGE_SIZE") // 1024,
+        threading.active_count(),
+        len(list(Path("/proc/self/fd").iterdir())),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts handles in /proc")
+def test_nothing_piles_up_from_scan_to_scan(tmp_path: Path) -> None:
+    seen = []
+    for number in range(int(os.environ.get("ENDURANCE_SCANS", "300"))):
+        outputs = session.Outputs((tmp_path / "a.ply",), record=tmp_path / "a.mcap")
+        with session.prepare_scan(session.Choice("twin-quick", QUICK), outputs, view=False) as job:
+            assert job.run(lambda _: None, lambda: False).ended == "finished"
+        (tmp_path / "a.mcap").unlink()
+        seen.append(held())
+        if number in (19, 49) or number % 100 == 99:
+            print(f"after {number + 1} scans: {seen[-1][0]} kB, {seen[-1][1]} threads, {seen[-1][2]} handles")
+    settled, last = seen[len(seen) // 3], seen[-1]
+    assert last[1:] == settled[1:]
+    assert last[0] < settled[0] * 1.03 + 2000
