@@ -19,7 +19,7 @@ from scanmap.solvers.board import parse_board
 from scanmap.solvers.board_line import BoardLine, find_board_line, points_on_board
 from scanmap.solvers.detection import Rejected, find_board
 from scanmap.solvers.intrinsics import calibrate_camera
-from scanmap.solvers.laser_plane import fit_laser_plane, head_frame_of, plane_in_camera, with_laser_plane
+from scanmap.solvers.laser_plane import fit_laser_plane, head_frame_of, plane_in_camera, residual_of, with_laser_plane
 
 BOARD = parse_board("chessboard:9x6:30mm")
 HEAD = Head()
@@ -148,6 +148,14 @@ def test_one_wrong_board_is_found_and_named() -> None:
     assert [each.name for each in fit.rejected] == ["the wrong one"]
     off = fit.plane * np.sign(fit.plane @ plane_in_camera(TRUTH)) - plane_in_camera(TRUTH)
     assert np.abs(off).max() < 1e-3
+
+
+def test_a_check_forgives_one_wrong_board_and_no_wrong_plane() -> None:
+    some = lines(9)
+    some[4] = some[4]._replace(columns=some[4].columns + 12.0)
+    plane = plane_in_camera(TRUTH)
+    assert residual_of(plane, some, BOARD, TRUTH.intrinsics)[1] < 0.3
+    assert residual_of(plane + np.array([0.0, 0.0, 0.0, 2e-3]), some, BOARD, TRUTH.intrinsics)[1] > 1.0
 
 
 def test_too_few_boards_and_boards_at_one_distance_are_refused() -> None:

@@ -154,8 +154,14 @@ def head_frame_of(plane: Array) -> Array:
 
 
 def residual_of(plane: Array, lines: Sequence[BoardLine], board: Board, intrinsics: Intrinsics) -> tuple[float, float]:
-    """How far the lines lie from a given plane (4,) of the camera frame: rms [m], rms [image columns]."""
+    """How far the lines lie from a given plane (4,) of the camera frame: rms [m], rms [image columns].
+
+    A few boards that show something else are left out as in the fit; many are the plane's fault and count.
+    """
     clouds = [points_on_board(line, board, intrinsics) for line in lines]
+    bound = 0.5 * ODD_PX * max(1.0, intrinsics.width / 1600.0)
+    near = [cloud for cloud in clouds if np.median(np.abs(_off_px(plane, cloud))) <= bound]
+    clouds = near if len(near) >= (1.0 - ODD_SHARE) * len(clouds) else clouds
     return _rms([p @ plane[:3] + plane[3] for p, _ in clouds]), _rms([_off_px(plane, cloud) for cloud in clouds])
 
 
