@@ -40,13 +40,14 @@ def noise_of(plane: U8) -> float:
     """Standard deviation of a sample's noise [grey levels], from differences of neighbours in a few rows."""
     # As many samples as tell it to a hundredth.
     rows = plane[:: max(1, len(plane) * min(plane.shape[1], 1600) // 20_000, len(plane) // 24)]
-    step = cv2.absdiff(np.ascontiguousarray(rows[:, 1:]), np.ascontiguousarray(rows[:, :-1]))
+    rows = np.ascontiguousarray(rows)
+    step = cv2.absdiff(rows[:, 1:], rows[:, :-1])
     # Half of all differences of Gaussian noise lie below 0.954 sigma; counting is finer than the median of integers.
     count = cv2.calcHist([step], [0], None, [64], [0.0, 64.0]).ravel().cumsum() / max(step.size, 1)
-    k = min(int(np.searchsorted(count, 0.5)), 63)
-    below = count[k - 1] if k else 0.0
-    median = k - 0.5 + (0.5 - below) / max(count[k] - below, 1e-9)
-    return float(np.clip(median / 0.954, 0.3, 60.0))
+    k = min(int(count.searchsorted(0.5)), 63)
+    below = float(count[k - 1]) if k else 0.0
+    median = k - 0.5 + (0.5 - below) / max(float(count[k]) - below, 1e-9)
+    return min(max(median / 0.954, 0.3), 60.0)
 
 
 def find_candidates(

@@ -41,11 +41,14 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
     step = 1 + len(row) // _ENOUGH_ROWS
     every, by_run = row, run
     row, run = row[::step], run[::step]
-    middle, left, right = (_sampled(plane, row, column[row] + k * _AT * width[row]) for k in (0.0, -1.0, 1.0))
-    below = [_sampled(plane, row, column[row] + k * 3.0 * width[row]) for k in (-1.0, 1.0)]
-    shoulder, top = np.minimum(left - below[0], right - below[1]), middle - np.maximum(*below)
+    at = column[row] + np.array([[0.0], [-_AT], [_AT], [-3.0], [3.0]]) * width[row]
+    middle, left, right, below_left, below_right = _sampled(plane, row, at)
+    shoulder = np.minimum(left - below_left, right - below_right)
+    top = middle - np.maximum(below_left, below_right)
     clipped = middle >= SATURATED
     excess = shoulder - _FLAT * top
+    if not (excess > 0.0).any():
+        return flat
     total = np.zeros((5, len(row) + 1))
     np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
     index, reach = np.arange(len(row)), max(2, _NEARBY // step)
@@ -62,8 +65,8 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
 
 
 def _sampled(plane: U8, row: Index, column: F64) -> F64:
-    """Values (N,) at columns between samples, interpolated."""
-    x = np.clip(column, 0.0, plane.shape[1] - 1.001)
+    """Values (n, N) at columns (n, N) between samples of rows (N,), interpolated."""
+    x = np.minimum(np.maximum(column, 0.0), plane.shape[1] - 1.001)
     left = x.astype(np.intp)
     part = x - left
     value: F64 = plane[row, left] * (1.0 - part) + plane[row, left + 1] * part

@@ -40,15 +40,15 @@ def speckle_contrast(residual: F32, signal: F32, weight: F32, sample_noise: floa
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
     quick = slice(None, None, max(1, residual.shape[1] // 128))
-    weights, left = weight[:, quick], residual[:, quick]
+    weights, left = np.ascontiguousarray(weight[:, quick]), np.ascontiguousarray(residual[:, quick])
     own = np.sort(dot(weights * left, left) / np.maximum(weights.sum(axis=0) - 4.0, 1.0))
     if not len(own) or own[len(own) // 2] < _MORE_SCATTER * sample_noise**2:
         return 0.0
     stride = max(1, residual.shape[1] // 300)
-    pairs = [(values[:, 1::stride], values[:, :-1:stride]) for values in (residual, signal, weight)]
-    step = pairs[0][0] - pairs[0][1]
-    level = np.minimum(*pairs[1])
-    core = (level > 0.4 * level.max(axis=0, initial=0.0)) * (pairs[2][0] * pairs[2][1])
+    step = residual[:, 1::stride] - residual[:, :-1:stride]
+    level = np.minimum(signal[:, 1::stride], signal[:, :-1:stride])
+    core = weight[:, 1::stride] * weight[:, :-1:stride]
+    core *= level > 0.4 * level.max(axis=0, initial=0.0)
     count = core.sum(axis=0)
     usable = count >= 2
     if usable.sum() < 20:

@@ -21,19 +21,21 @@ _CONTEXT = 6  # blocks on either side of a contested one that decide with it
 
 
 def strips(plane: U8, row: Index, column: Index, half: int) -> U8:
-    """Samples (2 half + 1, N) around each column; the edge's own repeated outside the image.
+    """Samples (2 half + 1, N) around each column, or (2 half + 1, 3, N); the edge's own repeated outside the image.
 
     Args:
-        plane: (H, W), or a view of one channel of a picture (H, W, 3).
+        plane: (H, W), or a view of one channel of a picture (H, W, 3), or the picture.
     """
-    width, apart = plane.shape[1], plane.strides[1]
+    width, apart, whole = plane.shape[1], plane.strides[1], plane.ndim == 3
+    shape = (2 * half + 1, 3, len(row)) if whole else (2 * half + 1, len(row))
     if not row.size:
-        return np.empty((2 * half + 1, 0), np.uint8)
+        return np.empty(shape, np.uint8)
     if column.min() < half or column.max() >= width - half:
         x = np.clip(column[:, None] + np.arange(-half, half + 1), 0, width - 1)
-        return np.asarray(cv2.transpose(plane[row[:, None], x]), np.uint8)
-    runs = runs_of(plane, apart * 2 * half + 1)[row, apart * (column - half)]
-    return np.asarray(cv2.transpose(runs), np.uint8)[::apart]
+        return np.asarray(cv2.transpose(plane[row[:, None], x].reshape(len(row), -1)), np.uint8).reshape(shape)
+    runs = runs_of(plane, apart * 2 * half + (3 if whole else 1))[row, apart * (column - half)]
+    across = np.asarray(cv2.transpose(runs), np.uint8)
+    return across.reshape(shape) if whole else across[::apart]
 
 
 def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
@@ -111,38 +113,41 @@ def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, 
 
 def _best_path(column: F32, gain: F32) -> F32:
     """Columns (B,) of the best path through the candidates (B, n) of one stretch."""
-    blocks, states = column.shape
-    columns, gains = column.tolist(), gain.tolist()
-    # A state per candidate and one for "no line here", which costs nothing and connects to everything.
-    total = [0.0] * (states + 1)
-    where: list[float] = [float("nan")] * (states + 1)
+    nan = float("nan")
+    # What a path is worth that ends at each candidate, and where; and one for "no line here", which costs nothing and
+    # connects to everything.
+    ends: list[tuple[float, float]] = [(0.0, nan)]
+    without = 0.0
     back: list[list[int]] = []
-    for k in range(blocks):
-        line = max(range(states), key=total.__getitem__)
-        from_none = total[states] - 0.5 * JUMP
+    places: list[list[float]] = []
+    for columns, gains in zip(column.tolist(), gain.tolist(), strict=True):
+        last = len(ends)
+        line, best = last, -1e29
+        for i, (value, _) in enumerate(ends):
+            if value > best:
+                line, best = i, value
+        from_none, from_line = without - 0.5 * JUMP, best - JUMP
         fresh, came = [], []
-        for j in range(states):
-            if gains[k][j] <= 0:
-                fresh.append(-1e29)
-                came.append(states)
+        for place, worth in zip(columns, gains, strict=True):
+            if worth <= 0:
                 continue
-            value, source = total[line] - JUMP, line
-            if from_none > value:
-                value, source = from_none, states
-            for i in range(states):
-                if total[i] > value and not abs(columns[k][j] - where[i]) > CONNECTED_PX:
-                    value, source = total[i], i
-            fresh.append(value + gains[k][j])
+            value, source = (from_none, last) if from_none > from_line else (from_line, line)
+            for i, (total, where) in enumerate(ends):
+                if total > value and not abs(place - where) > CONNECTED_PX:
+                    value, source = total, i
+            fresh.append((value + worth, place))
             came.append(source)
-        end = total[line] - 0.5 * JUMP
-        fresh.append(max(total[states], end))
-        came.append(line if end > total[states] else states)
-        total, where = fresh, [*columns[k], float("nan")]
+        places.append([place for _, place in fresh])
+        end = best - 0.5 * JUMP
+        came.append(line if end > without else last)
+        without = max(without, end)
+        ends = fresh
         back.append(came)
-    path = np.full(blocks, np.nan, np.float32)
-    state = max(range(states + 1), key=lambda j: total[j])
-    for k in range(blocks - 1, -1, -1):
-        if state < states:
-            path[k] = columns[k][state]
+    path = np.full(len(column), nan, np.float32)
+    totals = [value for value, _ in ends] + [without]
+    state = totals.index(max(totals))
+    for k in range(len(path) - 1, -1, -1):
+        if state < len(places[k]):
+            path[k] = places[k][state]
         state = back[k][state]
     return path

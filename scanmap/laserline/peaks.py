@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -24,6 +24,7 @@ _SPECKLE_ROWS = 31  # rows over which the line's height is smoothed for a first 
 _OFF_MOST = 1.2  # [px] from the middle of the window, and
 _NARROW_PX, _WIDEST = 0.75, 6.2  # the widths, the wider as a part of the window, at which sums are integrals
 _MOSTLY = 0.75  # share of the rows that lack samples, from which on all are fitted as they are
+_FEW_ROWS = 64
 _STRAY = 0.01  # share of the rows that is not worth another kind of step
 _DIM = 11.0  # heights, in noise, from whose first guess the way is too long for that
 _ROOT_PI, _ROOT_2PI = float(np.sqrt(np.pi)), float(np.sqrt(2.0 * np.pi))
@@ -73,7 +74,8 @@ def fit_gaussian(
     clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
     y = levelled(y, x, sample_noise)
     fit = start = _start(y, x)
-    mostly_cut = len(cut) > _MOSTLY * y.shape[1]
+    # A step for so few costs as much as for many, and those for whole lines are not the last ones.
+    mostly_cut = len(cut) > _MOSTLY * y.shape[1] or y.shape[1] < _FEW_ROWS
     for _ in range(0 if mostly_cut else _ITERATIONS):
         fit = _improve_whole(x, _Look(y, x, fit), fit)
     odd = (np.abs(fit.u) > _OFF_MOST) | (fit.s < _NARROW_PX) | (fit.s > n / _WIDEST) | (_DIM * sample_noise > fit.A)
@@ -215,21 +217,18 @@ def _fit_part(y: F32, x: F32, usable: F32, fit: _Fit, least: F32) -> _Fit:
 
 def _improve(y: F32, x: F32, weight: F32, fit: _Fit) -> _Fit:
     """One Gauss-Newton step."""
+    basis = np.empty((5, *y.shape), np.float32)
+    level, g, q, d, basis[4] = *basis[:4], y
     z = (x - fit.u) / fit.s
-    g = np.exp(np.float32(-0.5) * z * z)
-    d = g * z  # derivative by u, times s / A
-    q = d * z  # derivative by s, times s / A
-    wg, wd, wq = weight * g, weight * d, weight * q
-    # Normal equations of (b, A, s, u); g q = d d, so that only thirteen sums differ.
-    dd = dot(wd, d)
-    normal = (
-        (weight.sum(axis=0), wg.sum(axis=0), wq.sum(axis=0), wd.sum(axis=0)),
-        (dot(wg, g), dd, dot(wg, d)),
-        (dot(wq, q), dot(wq, d)),
-        (dd,),
-    )
-    right = (dot(weight, y), dot(wg, y), dot(wq, y), dot(wd, y))
-    (b, A, t, p), information = _solved(normal, right)
+    level[:] = 1.0
+    np.exp(np.float32(-0.5) * z * z, out=g)
+    np.multiply(g, z, out=d)  # derivative by u, times s / A
+    np.multiply(d, z, out=q)  # derivative by s, times s / A
+    # Normal equations of (b, A, s, u), upper triangle, and their right side.
+    normal = np.zeros((4, 5, y.shape[1]))
+    for i, own in enumerate((weight, weight * g, weight * q, weight * d)):
+        normal[i, i:] = np.einsum("jn,kjn->kn", own, basis[i:])
+    (b, A, t, p), information = _solved(normal)
     A = np.maximum(A, 0.5)
     half = len(x) // 2
     u = np.clip(fit.u + np.clip(p / A, -1.0, 1.0) * fit.s, -half, half)
@@ -237,29 +236,27 @@ def _improve(y: F32, x: F32, weight: F32, fit: _Fit) -> _Fit:
     return _Fit(*(values.astype(np.float32) for values in (u, s, A, b, information)))
 
 
-def _solved(normal: Sequence[Sequence[F32]], right: Sequence[F32]) -> tuple[list[F64], F64]:
-    """Solutions (N,) of N symmetric systems, upper triangles given, by Cholesky; and 1 / inverse[-1, -1] of each."""
-    n = len(right)
-    lower: list[list[F64]] = [[] for _ in range(n)]
-    forward: list[F64] = []
-    for i in range(n):
-        for j in range(i + 1):
-            value = normal[j][i - j].astype(np.float64)
-            if i == j:
-                value = value * (1.0 + 1e-6) + 1e-6
-            for k in range(j):
-                value = value - lower[i][k] * lower[j][k]
-            lower[i].append(np.sqrt(np.maximum(value, 1e-9)) if i == j else value / lower[j][j])
-        rest = right[i].astype(np.float64)
-        for k in range(i):
-            rest = rest - lower[i][k] * forward[k]
-        forward.append(rest / lower[i][i])
-    solution: list[F64] = forward.copy()
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            solution[i] = solution[i] - lower[k][i] * solution[k]
-        solution[i] = solution[i] / lower[i][i]
-    return solution, lower[-1][-1] ** 2
+def _solved(normal: F64) -> tuple[F64, F64]:
+    """Solutions (n, N) of N symmetric systems, by elimination; and 1 / inverse[-1, -1] of each.
+
+    Args:
+        normal: (n, n + 1, N) upper triangles and right sides; changed.
+    """
+    n = len(normal)
+    for i, row in enumerate(normal):
+        # What ill-conditioned rows need to be solved at all.
+        row[i] += 1e-6
+        row[i] *= 1.0 + 1e-6
+    for i, row in enumerate(normal):
+        np.maximum(row[i], 1e-9, out=row[i])
+        below = row[i + 1 : n, None].copy()
+        row[i + 1 :] /= row[i]
+        normal[i + 1 :, i + 1 :] -= below * row[i + 1 :]
+    information = normal[-1, -2].copy()
+    solution = normal[:, n]
+    for i in range(n - 1, 0, -1):
+        solution[:i] -= normal[:i, i] * solution[i]
+    return solution, information
 
 
 def _fit_speckle(y: F32, x: F32, usable: F32, fit: _Fit, sample_noise: float, contrast: float) -> tuple[_Fit, F32]:

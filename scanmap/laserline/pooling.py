@@ -72,26 +72,31 @@ def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
         at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))[::2]
         if len(at) < TELLING:
             return 1.0
-        a, b, c, d, e = (column[at + k * lag] for k in range(5))
-        va, vb, vc, vd, ve = (variance[at + k * lag] for k in range(5))
+        rows = len(column) - span
+        a, b, c, d, e = (column[k : k + rows] for k in range(0, span + 1, lag))
+        va, vb, vc, vd, ve = (variance[k : k + rows] for k in range(0, span + 1, lag))
         step = a + e - 4.0 * (b + d) + 6.0 * c
-        ratio = np.sort(step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc))
-        squares.append(float(ratio[len(ratio) // 2]) / 0.455)  # the median of chi^2 with one degree of freedom
+        ratio = (step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc))[at]
+        middle = len(ratio) // 2
+        ratio.partition(middle)
+        squares.append(float(ratio[middle]) / 0.455)  # the median of chi^2 with one degree of freedom
     return float(np.sqrt(np.mean(squares)))
 
 
 def segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First row and end of the segment that each row belongs to."""
     rows = len(column)
-    step = np.diff(column)
+    step = column[1:] - column[:-1]
+    size = np.abs(step)
     # The slope on either side of a step; the smaller disagreement counts, so that a bend is no break.
-    before = np.concatenate([[np.nan, np.nan], step[:-2]]) if rows > 2 else np.full(rows - 1, np.nan)
-    after = np.concatenate([step[2:], [np.nan, np.nan]]) if rows > 2 else np.full(rows - 1, np.nan)
-    off = np.fmin(np.abs(step - before), np.abs(step - after))
-    off = np.where(np.isfinite(off), off, np.abs(step))
+    bend = np.abs(step[2:] - step[:-2])
+    off = np.full(len(step), np.nan)
+    off[2:] = bend
+    np.fmin(off[:-2], bend, out=off[:-2])
+    off = np.where(np.isnan(off), size, off)
     limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.hypot(sigma[1:], sigma[:-1]))
-    broken = ~(off <= limit) | (np.abs(step) > 8.0)
-    edge = np.concatenate([[True], broken, [True]])
+    edge = np.ones(rows + 1, bool)
+    edge[1:-1] = ~(off <= limit) | (size > 8.0)
     begins = np.flatnonzero(edge)
     number = np.cumsum(edge[:-1]) - 1
     return begins[number], begins[number + 1]

@@ -67,7 +67,8 @@ def no_line(height: int, reason: Reason) -> LaserLine:
 
 def without(line: LaserLine, mask: NDArray[np.bool_], reason: Reason) -> LaserLine:
     """The line, changed in place, without the rows of `mask` (H,)."""
-    line.reason[mask] = reason
-    for values in line[:4]:
-        values[mask] = np.nan
+    if mask.any():
+        line.reason[mask] = reason
+        for values in line[:4]:
+            values[mask] = np.nan
     return line

@@ -46,6 +46,9 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) 
     the room. The width across a slanted line is its width in the row times the cosine of the slant.
     """
     mask = np.zeros(len(column), bool)
+    with np.errstate(invalid="ignore"):
+        if not (width > NO_BLOB_PX).any():
+            return mask
     found = np.flatnonzero(np.isfinite(column))
     # Known as well as the noise allows, or simply well.
     bound = 1.062 * np.sqrt(width[found]) * max(noise, 1.0) / peak[found]

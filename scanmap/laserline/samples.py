@@ -50,11 +50,13 @@ class Samples(NamedTuple):
 def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     """The samples around integer columns (N,) of rows (N,)."""
     lit, seen = sight.lit, sight.plane
-    y = strips(lit, row, column, REACH)
-    bright = y if seen is lit else strips(seen, row, column, REACH)
     beside = outside = None
     if sight.image is not None and sight.compressed:
-        beside = strips(sight.image[..., NEIGHBOUR[sight.channel]], row, column, REACH)
+        across = strips(sight.image, row, column, REACH)
+        y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
+    else:
+        y = strips(lit, row, column, REACH)
+    bright = y if seen is lit else strips(seen, row, column, REACH)
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
