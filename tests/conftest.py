@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from scanmap import session
 
@@ -15,6 +16,11 @@ SMALL = (
     "calibration.image.height=960",
     "sweep.step_deg=5.0",
 )
+
+
+# Wall time is no law on a machine that others use too.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
 import random
@@ -185,10 +186,15 @@ def test_backlash_is_taken_up(uno: Uno) -> None:
 
 
 class NoCamera:
+    """A camera whose pictures show nothing, but never twice the same: one that repeats itself is frozen."""
+
     width = height = 1
 
+    def __init__(self) -> None:
+        self.numbers = itertools.count()
+
     def grab(self) -> Frame:
-        return Frame(b"", 0.0)
+        return Frame(str(next(self.numbers)).encode(), 0.0)
 
     def close(self) -> None: ...
 
