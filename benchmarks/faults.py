@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import functools
 import logging
 import math
 import tempfile
@@ -24,7 +25,7 @@ from scanmap import session
 from scanmap.errors import CameraError, ScanmapError
 from scanmap.recording import open_source
 from scanmap.scan.formats import read_ply
-from scanmap.session import preparing
+from scanmap.session import preparing, rigs
 from scanmap.session.rigs import OpenRig, TwinDevices, open_rig
 from scanmap.shot import Shot
 from scanmap.sweep.matching import same_line, shift_between
@@ -234,6 +235,7 @@ def main() -> None:
     parser.add_argument("--words", action="store_true", help="print every message")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
+    rigs.build_scene = functools.lru_cache(rigs.build_scene)  # the light of the room is computed once
     print("| fault | overcome / stopped | noticed after (shots) | lost | wrong | laser off | equal |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as text:

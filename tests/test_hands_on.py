@@ -30,6 +30,8 @@ from scanmap.session.knobs import Knobs
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import plug, pty_port
 
+pytestmark = pytest.mark.usefixtures("baked_once")
+
 SMALL = ("--set", "calibration.image.width=320", "--set", "calibration.image.height=240")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from conftest import baked_scene
 from fake_cameras import FakeCapture, FakeDevice
 
 from scanmap import config as configuration
@@ -20,11 +21,14 @@ from scanmap.rig import grbl as grbl_module
 from scanmap.session.rigs import open_rig
 from scanmap.shot import decode_image
 from scanmap.sweep import SweepParams, plan, sweep
-from scanmap.twin import Truth, TwinCamera, build_scene
+from scanmap.twin import Truth, TwinCamera
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import pty_port
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
+pytestmark = [
+    pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX"),
+    pytest.mark.usefixtures("baked_once"),
+]
 
 HARDWARE = (
     "rig=hardware", "calibration.image.width=320", "calibration.image.height=240", "sweep.end_deg=40",
@@ -39,7 +43,7 @@ class Head:
     def __init__(self) -> None:
         self.config = configuration.load("twin-room", HARDWARE)
         self.board = Firmware()
-        self.scene = build_scene(self.config.twin, self.config.twin.light)
+        self.scene = baked_scene(self.config.twin, self.config.twin.light)
         self.camera = TwinCamera(self.scene, self.config.head(), self.config.twin, state=self._state)
         self.device = FakeDevice(period_s=0.02, sizes=((320, 240),), picture=lambda _: self.camera.grab().image)
 

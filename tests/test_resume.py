@@ -16,6 +16,8 @@ from scanmap.recording import describe, open_source
 from scanmap.session import preparing
 from scanmap.session.rigs import OpenRig, open_rig
 
+pytestmark = pytest.mark.usefixtures("baked_once")
+
 QUICK = ("calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=20")
 SWITCH = ("stage.homing='switch'", "twin.drive.switch_deg=-3.0", "stage.home_deg=-2")
 

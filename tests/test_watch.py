@@ -18,6 +18,8 @@ from scanmap.session.watching import watch_of
 from scanmap.shot import Shot, encode_png
 from scanmap.sweep import shift_between, sweep
 
+pytestmark = pytest.mark.usefixtures("baked_once")
+
 SMALL = ("calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=3", "sweep.end_deg=36")
 SWITCH = ("stage.homing='switch'", "twin.drive.switch_deg=-3.0", "stage.home_deg=-2")
 
