@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
-from scanmap.laserline.grey import runs_of
+from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
 
 F32 = NDArray[np.float32]
@@ -75,9 +75,10 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
         return doubt
     profile, brightest = _profiles(image, block, candidates.column[block, which])
-    height = profile[:, _HALF - 2 : _HALF + 3].mean(axis=1) - profile[:, [0, 1, -2, -1]].mean(axis=1)
+    sides = profile[:, 0] + profile[:, 1] + profile[:, -2] + profile[:, -1]
+    height = profile[:, _HALF - 2 : _HALF + 3].sum(axis=1) * np.float32(0.2) - sides * np.float32(0.25)
     own = np.maximum(height[:, channel], 1.0)
-    other = np.delete(height, channel, axis=1).max(axis=1)
+    other = np.maximum(height[:, channel - 1], height[:, channel - 2])
     saturated = brightest[:, channel] >= COLOURLESS
     share = np.full(candidates.snr.shape, np.nan, np.float32)
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
@@ -181,7 +182,7 @@ def _across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
     """Samples (2 _HALF + 1, 3, N) around N places of a picture (H, W, 3)."""
     length = 2 * _HALF + 1
     x = np.clip(column, _HALF, image.shape[1] - 1 - _HALF)
-    runs = runs_of(image, 3 * length)[row, 3 * (x - _HALF)]
+    runs = runs_at(image, row, 3 * (x - _HALF), 3 * length)
     return np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
 
 
@@ -191,10 +192,13 @@ def _profiles(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
     row = np.minimum(block * BLOCK, height - BLOCK)
     x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
     length = 2 * _HALF + 1
-    view = runs_of(image, 3 * length)
-    first = view[row[:, None] + np.arange(BLOCK), 3 * (x - _HALF)[:, None]].reshape(-1, BLOCK, length, 3)
-    profile = first.sum(axis=1, dtype=np.uint16) * np.float32(1.0 / BLOCK)
-    return profile, first[:, :, _HALF - 2 : _HALF + 3].max(axis=(1, 2))
+    runs = [runs_at(image, row + k, 3 * (x - _HALF), 3 * length) for k in range(BLOCK)]
+    total, brightest = runs[0].astype(np.uint16), runs[0]
+    for run in runs[1:]:
+        total += run
+        brightest = np.maximum(brightest, run)
+    core = brightest.reshape(-1, length, 3)[:, _HALF - 2 : _HALF + 3]
+    return (total * np.float32(1.0 / BLOCK)).reshape(-1, length, 3), core.max(axis=1)
 
 
 def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:

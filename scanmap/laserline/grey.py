@@ -6,7 +6,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from scanmap.errors import ConfigError
@@ -14,6 +13,7 @@ from scanmap.laserline.channel import SATURATED, laser_channel
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
+Index = NDArray[np.intp]
 
 Grey = Literal[
     "auto",
@@ -133,18 +133,31 @@ def extract(image: U8, channel: int) -> U8:
     return np.asarray(cv2.extractChannel(image, channel), np.uint8)
 
 
-def runs_of(image: U8, length: int) -> U8:
-    """Every run of `length` bytes side by side in each row (H, n, length), a view.
+def runs_at(image: U8, row: Index, first: Index, length: int) -> U8:
+    """Runs (..., length) of bytes side by side in rows (...), each from its `first` byte on, copied.
 
     Args:
         image: (H, W), (H, W, 3), or one channel of the latter, whose columns are three bytes apart.
 
-    A picture's runs are copied at ten times the speed of picking its samples one by one.
+    Whole runs are copied at ten times the speed of picking a picture's samples one by one.
     """
-    size = image.strides[1] * (image.shape[1] - 1) + (image.shape[2] if image.ndim == 3 else 1)
-    return as_strided(
-        image, (len(image), size - length + 1, length), (image.strides[0], 1, 1), subok=False, writeable=False
-    )
+    runs = np.asarray(_Runs(image, length))[row, first]
+    return runs.view(np.uint8).reshape(*runs.shape, length)
+
+
+class _Runs:
+    """Every run of bytes in each row of a picture (H, n), each one item, in NumPy's array interface."""
+
+    def __init__(self, image: U8, length: int) -> None:
+        size = image.strides[1] * (image.shape[1] - 1) + (image.shape[2] if image.ndim == 3 else 1)
+        self.image = image  # must live as long as what is made of this
+        self.__array_interface__ = {
+            "version": 3,
+            "data": (image.__array_interface__["data"][0], True),
+            "typestr": f"|V{length}",
+            "shape": (len(image), size - length + 1),
+            "strides": (image.strides[0], 1),
+        }
 
 
 def _bits(image: U8, n: int) -> U8:

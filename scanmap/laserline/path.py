@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import BLOCK, Candidates
-from scanmap.laserline.grey import runs_of
+from scanmap.laserline.grey import runs_at
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -33,7 +33,7 @@ def strips(plane: U8, row: Index, column: Index, half: int) -> U8:
     if column.min() < half or column.max() >= width - half:
         x = np.clip(column[:, None] + np.arange(-half, half + 1), 0, width - 1)
         return np.asarray(cv2.transpose(plane[row[:, None], x].reshape(len(row), -1)), np.uint8).reshape(shape)
-    runs = runs_of(plane, apart * 2 * half + (3 if whole else 1))[row, apart * (column - half)]
+    runs = runs_at(plane, row, apart * (column - half), apart * 2 * half + (3 if whole else 1))
     across = np.asarray(cv2.transpose(runs), np.uint8)
     return across.reshape(shape) if whole else across[::apart]
 
