@@ -155,8 +155,10 @@ def _strongest(
         response[:, : max(int(np.ceil(first[0])) // scale, 0)] = 0
         response[:, max(int(np.floor(last[0])) // scale + 1, 0) :] = 0
     else:
-        x = np.arange(width, dtype=np.float32) * scale + 0.5 * (scale - 1)
-        response[~((x >= first[:, None] - scale) & (x <= last[:, None] + scale))] = 0
+        x = np.arange(width, dtype=np.float32) * scale + np.float32(0.5 * (scale - 1))
+        response *= (x >= (first[:, None] - scale).astype(np.float32)) & (
+            x <= (last[:, None] + scale).astype(np.float32)
+        )
     column = np.zeros((blocks, count), np.float32)
     value = np.zeros((blocks, count), np.float32)
     rows = np.arange(blocks)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
 from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
+from scanmap.laserline.runs import numbered
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -120,7 +121,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
     row = np.flatnonzero(np.isfinite(column))
     if not row.size or image.shape[1] <= 2 * _HALF:
         return lost
-    run = np.concatenate([[0], np.cumsum((np.diff(row) > 1) | (np.abs(np.diff(column[row])) > 3.0))])
+    run = numbered(row, column[row], 1)
     doubtful = (np.bincount(run, pure[row]) < _MOSTLY * np.bincount(run))[run]
     if not doubtful.any():
         return lost

@@ -33,7 +33,8 @@ def bright_core(y: F32) -> Cores:
     x = np.arange(y.shape[1], dtype=np.float32) - half
     top = y[:, half - 4 : half + 5].max(axis=1)
     peak = half - 4 + y[:, half - 4 : half + 5].argmax(axis=1)
-    left, right = y[:, half - 8 : half - 5].mean(axis=1), y[:, half + 6 : half + 9].mean(axis=1)
+    left, right = y[:, half - 8] + y[:, half - 7] + y[:, half - 6], y[:, half + 6] + y[:, half + 7] + y[:, half + 8]
+    left, right = left * np.float32(1.0 / 3.0), right * np.float32(1.0 / 3.0)
     side = np.maximum(left, right)
     level = np.maximum(np.minimum(side, top - 4.0), top - _CORE_SHARE * (top - np.minimum(left, right)))
     w = np.maximum(y - level[:, None], 0.0)

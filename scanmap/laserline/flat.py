@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.runs import numbered
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -36,7 +37,7 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
         row = np.flatnonzero((width > _WIDE_PX) & (peak < SATURATED))
     if len(row) < _LEAST_ROWS:
         return flat
-    run = np.concatenate([[0], np.cumsum((np.diff(row) > 2) | (np.abs(np.diff(column[row])) > 3.0))])
+    run = numbered(row, column[row], 2)
     # Of many rows some tell of all.
     step = 1 + len(row) // _ENOUGH_ROWS
     every, by_run = row, run

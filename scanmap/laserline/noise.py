@@ -57,7 +57,8 @@ def speckle_contrast(residual: F32, signal: F32, weight: F32, sample_noise: floa
     power = dot(core * level, level)[usable] / count[usable]
     # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
     excess = (scatter / _CORE_KEEPS - 1.5 * sample_noise**2) / power
-    return float(np.sqrt(max(float(np.median(excess)) / 0.8, 0.0)))
+    excess.partition(len(excess) // 2)
+    return float(np.sqrt(max(float(excess[len(excess) // 2]) / 0.8, 0.0)))
 
 
 def dot(a: F32, b: F32) -> F32:

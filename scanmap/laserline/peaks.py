@@ -242,10 +242,10 @@ def _solved(normal: F64) -> tuple[F64, F64]:
         normal: (n, n + 1, N) upper triangles and right sides; changed.
     """
     n = len(normal)
-    for i, row in enumerate(normal):
-        # What ill-conditioned rows need to be solved at all.
-        row[i] += 1e-6
-        row[i] *= 1.0 + 1e-6
+    # What ill-conditioned rows need to be solved at all.
+    diagonal = np.einsum("iik->ik", normal[:, :n])
+    diagonal *= 1.0 + 1e-6
+    diagonal += 1e-6
     for i, row in enumerate(normal):
         np.maximum(row[i], 1e-9, out=row[i])
         below = row[i + 1 : n, None].copy()

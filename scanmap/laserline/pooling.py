@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
@@ -115,8 +117,7 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     y = np.where(known, column - base, 0.0)
     wy = weight * y
     # All moments of all windows at once: one row of the picture after the other, times powers of its place.
-    t = (np.arange(rows) - rows // 2) * (2.0 / rows)
-    powers = t ** np.arange(5)[:, None]
+    powers = _powers(rows)
     # A window for every row of the picture, or only those asked for.
     few = 4 * len(at) < len(column)
     asked: Index | slice = first if few else slice(None)
@@ -144,6 +145,13 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     line = (m2[own] - 2.0 * tau * m1[own] + tau * tau * m0[own]) * per_det[own]
     variance = line + off * off / power[own] * spread[own]
     return base + value, np.sqrt(variance), chi2[own]
+
+
+@cache
+def _powers(rows: int) -> Array:
+    """Powers 0 to 4 (5, rows) of the places in a window, from about -1 to 1."""
+    t = (np.arange(rows) - rows // 2) * (2.0 / rows)
+    return np.asarray(t ** np.arange(5)[:, None], np.float64)
 
 
 def _windows(values: Array, rows: int) -> Array:

@@ -39,6 +39,17 @@ def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask) -> In
     return np.asarray(asked[near], np.intp)
 
 
+def numbered(row: Index, column: Array, gap: int) -> Index:
+    """Number (N,) of the run that each of the rows (N,), rising, belongs to: no more than `gap` rows and 3 px a step.
+
+    Args:
+        column: (N,) [px].
+    """
+    run = np.zeros(len(row), np.intp)
+    np.cumsum((row[1:] - row[:-1] > gap) | ~(np.abs(column[1:] - column[:-1]) < 3.0), out=run[1:])
+    return run
+
+
 def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) -> Mask:
     """Rows (H,) far wider across the line than the sharpest good part of it, unless near and therefore bright.
 
@@ -64,10 +75,12 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) 
     slope[1:-1] = 0.5 * (column[2:] - column[:-2])
     slope = np.where(np.abs(slope) < 4.0, slope, 0.0)[found]
     across, height = width[found] / np.sqrt(1.0 + slope**2), peak[found]
-    good = np.sort(across[strong])
-    sharp = good[int(0.4 * len(good))]
+    good, bright, middle = across[strong], height[strong], int(np.count_nonzero(strong)) // 2
+    good.partition(int(0.4 * len(good)))
+    bright.partition(middle)
+    sharp, usual = good[int(0.4 * len(good))], bright[middle]
     blob = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < _NEAR)
-    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * np.median(height[strong]))
+    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * usual)
     # As wide and dim as the unevenness of a wall.
     blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
     mask[found[blob]] = True
@@ -111,8 +124,7 @@ def crumbs(column: Array, weak: Mask, least: int = 12) -> Mask:
     found = np.flatnonzero(np.isfinite(column))
     if not found.size:
         return mask
-    linked = (np.abs(np.diff(column[found])) < 3.0) & (np.diff(found) <= _GAP_ROWS + 1)
-    number = np.concatenate([[0], np.cumsum(~linked)])
+    number = numbered(found, column[found], _GAP_ROWS + 1)
     rows = np.bincount(number)
     doubtful = np.bincount(number, weak[found]) > 0.5 * rows
     mask[found[((rows < 4) | (doubtful & (rows < least)))[number]]] = True
