@@ -49,7 +49,11 @@ def test_banner_on_power_up_and_after_reset() -> None:
         ("G0X1(comment)Y2;rest", 0),
         ("10", 1),
         ("GX", 2),
-        ("$nonsense", 3),
+        ("$nonsense", 2),  # a setting whose number is missing
+        ("$Hello", 3),
+        ("$100", 3),
+        ("$100=", 2),
+        ("$100=80x", 3),
         ("$200=1", 3),
         ("$100=-1", 4),
         ("$H", 5),
@@ -84,6 +88,62 @@ def test_status_report_has_grbls_form_and_its_rare_fields(board: Firmware) -> No
     assert "WCO" in reports[10]
     say(board, "$10=2")
     assert say(board, b"?")[0].startswith("<Idle|WPos:-5.000,0.000,0.000|Bf:15,128|FS:0,0")
+
+
+def test_inches_have_four_decimals_everywhere(board: Firmware) -> None:
+    board.index_deg = -25.4
+    for line in ("$13=1", "G10 L2 P1 X2.54"):
+        say(board, line)
+    assert say(board, "G38.2 X-90 F600") == ["[PRB:-1.0000,0.0000,0.0000:1]", "ok"]
+    assert say(board, b"?") == ["<Idle|MPos:-1.0000,0.0000,0.0000|FS:0,0|WCO:0.1000,0.0000,0.0000>"]
+    parameters = say(board, "$#")
+    assert [line[1:4] for line in parameters[:-1]] == [
+        *(f"G{n}" for n in (54, 55, 56, 57, 58, 59, 28, 30, 92)),
+        "TLO",
+        "PRB",
+    ]
+    assert "[G54:0.1000,0.0000,0.0000]" in parameters
+
+
+def test_what_an_alarm_and_the_check_mode_lock(board: Firmware) -> None:
+    say(board, "$C")
+    assert [say(board, line)[-1] for line in ("$100=90", "$H", "$I", "$X")] == ["error:8"] * 3 + ["ok"]
+    say(board, "$C")
+    board.raise_alarm(5)
+    listen(board)
+    assert [say(board, line)[-1] for line in ("M5", "$C", "$N0=G21", "$1=255")] == [
+        "error:9",
+        "error:8",
+        "error:8",
+        "ok",
+    ]
+
+
+def test_a_dead_stop_lets_the_motor_go_even_where_it_should_hold(board: Firmware) -> None:
+    say(board, "$1=255")
+    board.write(b"G1 X90 F600\n")
+    board.wait(1.0)
+    board.trip_limit()
+    assert not board.motor_on
+
+
+def test_grblhal_refuses_gcode_after_an_error_until_it_hears_an_empty_line() -> None:
+    board = Firmware(dialect="grblHAL")
+    listen(board)
+    assert say(board, "G7") == ["error:20"]
+    assert say(board, "M5") == ["error:20"]
+    assert say(board, "") == say(board, "M5") == ["ok"]
+
+
+def test_grblhal_that_must_home_first_is_not_unlocked_by_hand() -> None:
+    board = Firmware(dialect="grblHAL", switch_deg=20.0)
+    board.memory.settings[22] = 5
+    board.power_cycle()
+    assert listen(board)[1:] == ["ALARM:11", "[MSG:Homing cycle required]"]
+    assert say(board, "$X") == ["error:46"]
+    assert say(board, "$HX") == ["error:5"]  # $22 has no bit for one axis
+    assert say(board, "$22=7") == say(board, "$HX") == ["ok"]
+    assert board.state == "Idle"
 
 
 def test_ok_means_planned_and_a_dwell_proves_arrival(board: Firmware) -> None:
@@ -267,7 +327,9 @@ def test_startup_lines_run_after_a_reset(board: Firmware) -> None:
 
 
 def test_sleep_needs_a_reset(board: Firmware) -> None:
-    assert say(board, "$SLP") == ["ok"]
+    say(board, "$1=255")
+    assert say(board, "$SLP") == ["ok", "[MSG:Sleeping]"]
+    assert not board.motor_on
     assert say(board, b"?")[0].startswith("<Sleep")
     assert say(board, "G0X1") == []
     assert say(board, b"\x18")[-1] == "[MSG:'$H'|'$X' to unlock]"

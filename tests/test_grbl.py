@@ -26,6 +26,7 @@ from scanmap.rig.grbl import GrblStage, open_grbl
 from scanmap.rig.serial_port import SerialPort
 from scanmap.rig.stage import StageParams, open_stage
 from scanmap.sweep import SweepParams, sweep
+from scanmap.twin.board import DialectName
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.motion import Drivetrain
 from scanmap.twin.ports import plug, pty_port, tcp_port
@@ -100,10 +101,11 @@ def test_limits_hold(stage: Stage, board: Firmware) -> None:
 
 
 def test_after_close_the_laser_is_off_and_the_motor_free(stage: Stage, board: Firmware) -> None:
+    if board.dialect == "FluidNC":
+        board.memory.settings[1] = 255  # stepping/idle_ms of its file, which docs/wiring.md asks for
     stage.move_to(1.0)
     stage.laser(True)
-    if board.dialect != "FluidNC":
-        assert board.motor_on
+    assert board.motor_on
     stage.close()
     stage.close()
     assert eventually(lambda: not board.laser_on and not board.motor_on)
@@ -212,6 +214,15 @@ def test_homing_gives_the_same_bearing_wherever_the_head_stood(homing: str) -> N
             stage.move_to(math.pi / 2)
             assert math.degrees(board.bearing) == pytest.approx(90.0, abs=1 / 80)
             stage.close()
+
+
+@pytest.mark.parametrize("dialect", ["grbl", "grblHAL", "FluidNC"])
+def test_homing_without_a_switch_is_said_in_every_dialect(dialect: DialectName) -> None:
+    board = Firmware(dialect=dialect, switch_deg=None)
+    board.memory.settings.update({22: 1, 23: 1})
+    board.power_cycle()
+    with plug(board) as url, pytest.raises(StageError, match="ALARM:9, the limit switch was not found"):
+        open_grbl(StageParams(port=url, homing="switch", timeout_s=0.5))
 
 
 def test_by_hand_home_is_where_the_head_stands(uno: Uno) -> None:

@@ -9,7 +9,7 @@ import pytest
 from scanmap.errors import ConfigError, StageError
 from scanmap.rig.grbl import GrblStage
 from scanmap.rig.grbl_link import GrblLink
-from scanmap.rig.grbl_protocol import Dialect, dialect_of_build_info
+from scanmap.rig.grbl_protocol import Dialect, dialect_of_build_info, parse_banner, parse_status
 from scanmap.rig.manual import ManualStage
 from scanmap.rig.serial_port import SerialPort
 from scanmap.rig.stage import StageParams
@@ -76,6 +76,7 @@ OPEN_HAL: Script = [
 ]
 OPEN_FLUIDNC: Script = [
     (b"?", at(0)),
+    (b"$13\n", b"$13=0\r\nok\r\n"),
     (b"$/axes/x/steps_per_mm\n", b"$/axes/x/steps_per_mm=80.000\r\nok\r\n"),
     (b"$/stepping/idle_ms\n", b"$/stepping/idle_ms=255\r\nok\r\n"),
     PREAMBLE,
@@ -83,8 +84,8 @@ OPEN_FLUIDNC: Script = [
 ]
 CLOSE_FLUIDNC: Script = [
     (b"M5\n", OK),
-    (b"$MD\n", OK),
     (b"\x18", b"\r\nGrbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]\r\n"),
+    (b"$MD\n", b"[MSG:INFO: Disabling all motors]\r\nok\r\n"),
 ]
 
 
@@ -241,7 +242,7 @@ def test_outside_the_limits_nothing_is_sent() -> None:
 
 
 def test_homing_by_switch_at_opening() -> None:
-    settled = [(b"$H\n", OK), PREAMBLE, (b"?", at(-1.0)), (b"?", at(-1.0)), (b"M5\n", OK)]
+    settled = [(b"$H\n", OK), (b"?", at(-1.0)), PREAMBLE, (b"?", at(-1.0)), (b"?", at(-1.0)), (b"M5\n", OK)]
     stage, port = play([*OPEN_GRBL[:-2], *settled, *move(88.0)], homing="switch", home_deg=1.0)
     assert stage.move_to(math.pi / 2) == pytest.approx(math.pi / 2)
     finish(port)
@@ -249,7 +250,155 @@ def test_homing_by_switch_at_opening() -> None:
 
 def test_fluidnc_with_other_steps_in_its_file_is_refused() -> None:
     with pytest.raises(StageError, match=r"steps_per_mm is 80 .*steps_per_deg is 44.*make them equal"):
-        play(OPEN_FLUIDNC[:2], Dialect.FLUIDNC, steps_per_deg=44.0)
+        play(OPEN_FLUIDNC[:3], Dialect.FLUIDNC, steps_per_deg=44.0)
+
+
+LOCKED = b"<Alarm|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>\r\n"
+UNLOCK = b"\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
+SETTINGS_22 = b"$1=255\r\n$22=%d\r\n$32=0\r\n$100=80.000\r\n$110=6000.000\r\n$120=10.000\r\nok\r\n"
+
+
+def test_settings_are_read_and_written_while_the_board_waits_in_alarm_for_its_homing() -> None:
+    script: Script = [
+        (b"?", LOCKED),
+        (b"$$\n", LOCKED + OPEN_GRBL[1][1]),  # a report overtakes the answer
+        *((sent, LOCKED + OK) for sent, _ in OPEN_GRBL[2:-2]),
+        (b"\x18", UNLOCK),
+        (b"?", LOCKED),
+        (b"$H\n", OK),
+        (b"?", at(-1.0)),
+        PREAMBLE,
+        (b"?", at(-1.0)),
+        (b"?", at(-1.0)),
+        (b"M5\n", OK),
+    ]
+    _, port = play(script, homing="switch")
+    finish(port)
+
+
+def test_homing_without_a_switch_is_an_error_although_grbl_says_ok() -> None:
+    failed = b"ALARM:9\r\nok\r\n" + UNLOCK
+    script = [(b"?", LOCKED), (b"$$\n", SETTINGS_22 % 1), (b"$H\n", failed), (b"?", LOCKED)]
+    with pytest.raises(StageError, match="ALARM:9, the limit switch was not found"):
+        play(script, homing="switch")
+
+
+@pytest.mark.parametrize(
+    ("dialect", "flags", "sent"),
+    [(Dialect.GRBL, 1, b"$H\n"), (Dialect.GRBLHAL, 1, b"$H\n"), (Dialect.GRBLHAL, 3, b"$HX\n")],
+)
+def test_one_axis_homes_alone_only_where_the_board_allows_it(dialect: Dialect, flags: int, sent: bytes) -> None:
+    home = [(sent, OK), (b"?", at(-1.0)), PREAMBLE, (b"?", at(-1.0)), (b"?", at(-1.0)), (b"M5\n", OK)]
+    _, port = play([(b"?", at(0)), (b"$$\n", SETTINGS_22 % flags), *home], dialect, homing="switch")
+    finish(port)
+
+
+def test_grblhal_that_demands_homing_says_so() -> None:
+    alarm = b"<Alarm:11|MPos:0.000,0.000,0.000|Bf:100,1023|FS:0,0>\r\n"
+    with pytest.raises(StageError, match=r"error:46, the board must be homed first"):
+        play(
+            [(b"?", alarm), (b"$X\n", b"error:46\r\n"), (b"\n", OK), (b"$X\n", b"error:46\r\n"), (b"\n", OK)],
+            Dialect.GRBLHAL,
+        )
+
+
+def test_grblhal_is_told_that_its_error_was_heard_or_it_would_refuse_everything_after_it() -> None:
+    damaged = [(b"G53 G1 X10.0000 F1200.0\n", b"error:2\r\n"), (b"\n", OK), *move(10)]
+    stage, port = play([*OPEN_HAL, *damaged], Dialect.GRBLHAL)
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_fluidnc_with_verbose_errors_says_words_instead_of_numbers() -> None:
+    old = [(sent, reply) for sent, reply in OPEN_FLUIDNC]
+    old[2:3] = [(old[2][0], b"error:Invalid $ statement\r\n")] * 2  # asked again, refused again: not known
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    refused = [(line, b"error:Gcode undefined feed rate\r\n")] * 2
+    stage, port = play([*old, *refused], Dialect.FLUIDNC)
+    with pytest.raises(StageError, match=r"refused .*error:Gcode undefined feed rate"):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_fluidnc_that_reports_inches() -> None:
+    opening = [*OPEN_FLUIDNC]
+    opening[1] = (b"$13\n", b"$13=1\r\nok\r\n")
+    reported = b"<Idle|MPos:0.3937,0.0000,0.0000|FS:0,0>\r\n"
+    stage, port = play([*opening, *move(10)[:2], (b"?", reported)], Dialect.FLUIDNC)
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_the_index_mark_is_where_the_probe_says_also_in_inches() -> None:
+    inches = OPEN_GRBL[1][1].replace(b"$13=0", b"$13=1")
+    place = b"<Idle|MPos:-1.0000,0.0000,0.0000|FS:0,0>\r\n"
+    script = [
+        *OPEN_GRBL[:1],
+        (b"$$\n", inches),
+        *OPEN_GRBL[2:-2],
+        (b"$X\n", OK),
+        (b"?", place),
+        PREAMBLE,
+        (b"G91 G38.2 X-180.000 F300.0\n", b"[PRB:-1.0000,0.0000,0.0000:1]\r\nok\r\n"),
+        (b"G90\n", OK),
+        (b"?", place),
+        (b"M5\n", OK),
+    ]
+    stage, port = play(
+        [*script, *move(-15.4, 0)[:2], (b"?", b"<Idle|MPos:-0.6063,0.0000,0.0000|FS:0,0>\r\n")], homing="index"
+    )
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_reports_that_a_board_sends_by_itself_do_not_prove_that_an_answer_is_lost() -> None:
+    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000 F1200.0\n", at(0) * 5 + OK), *move(10)[1:]])
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_a_laser_that_an_alarm_keeps_from_m5_is_switched_off_by_a_reset() -> None:
+    locked = [(b"M5\n", b"error:9\r\n")] * 2
+    reset = [(b"!", b""), (b"?", LOCKED), (b"\x18", UNLOCK), (b"?", LOCKED)]
+    stage, port = play([*OPEN_GRBL, *locked, *reset])
+    stage.laser(False)
+    finish(port)
+    with pytest.raises(StageError, match="is in alarm"):
+        stage.move_to(0.1)
+
+
+@pytest.mark.parametrize(
+    ("lines", "dialect"),
+    [
+        ("Grbl 1.1h ['$' for help]|[VER:1.1h.20190830:]|[OPT:V,15,128]", Dialect.GRBL),
+        ("GrblHAL 1.1f ['$' or '$HELP' for help]|[VER:1.1f.20240812:]|[OPT:VNMSL,100,1024,3,0]", Dialect.GRBLHAL),
+        ("Grbl 1.1f ['$' for help]|[NEWOPT:ENUMS,RT+,HOME,TC,SED]|[FIRMWARE:grblHAL]", Dialect.GRBLHAL),
+        ("Grbl 3.7 [FluidNC v3.7.8 (noradio) '$' for help]|[VER:3.7 FluidNC v3.7.8:]|[OPT:PHS]", Dialect.FLUIDNC),
+    ],
+)
+def test_banners_and_build_infos(lines: str, dialect: Dialect) -> None:
+    first, *info = lines.split("|")
+    banner = parse_banner(first)
+    assert banner
+    assert dialect_of_build_info(info, banner.dialect) is dialect
+
+
+@pytest.mark.parametrize(
+    ("report", "state", "substate", "x"),
+    [
+        ("<Idle|WPos:1.000,0.000,0.000|Bf:15,128|FS:0,0|Pn:XYZ>", "Idle", 0, 1.0),
+        ("<Run:2|MPos:2.000|Bf:99,1023|Ln:7|FS:600,0|A:SFM|WCS:G54|H:1,1|FW:grblHAL>", "Run", 2, 2.0),
+        ("<Hold:1|MPos:3.000,0.000,0.000|F:500|Ov:100,100,100>", "Hold", 1, 3.0),
+        ("<Door:3|MPos:4.000,0.000,0.000|FS:0,0|Pn:D>", "Door", 3, 4.0),
+        ("<Alarm:11|MPos:5.000,0.000,0.000|FS:0,0>", "Alarm", 11, 5.0),
+        ("<Tool|MPos:6.000,0.000,0.000|FS:0,0>", "Tool", 0, 6.0),
+        ("<Sleep|MPos:7.000,0.000,0.000|FS:0,0>", "Sleep", 0, 7.0),
+    ],
+)
+def test_status_reports_of_the_dialects(report: str, state: str, substate: int, x: float) -> None:
+    status = parse_status(report)
+    assert status
+    assert (status.state, status.substate, status.position[0]) == (state, substate, x)
 
 
 def test_build_info_beats_a_disguised_banner() -> None:

@@ -25,6 +25,7 @@ BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
 GREETING_S = 0.3  # a board behind a network says its banner at once, if at all
 HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
 REPORT_DEG = 0.001  # resolution of a status report
+REPORT_INCH_DEG = 25.4e-4  # the same for a board that reports in inches ($13=1)
 STEP_DEG_UNKNOWN = 0.1  # how far off an arrival may be where the board does not tell its steps
 FAREWELL_S = 0.5  # how long the last reset may take to be confirmed
 
@@ -49,6 +50,7 @@ class GrblStage:
         self._from_below = False  # whether the last arrival took up the play
         self._closed = False
         self._watchdog: Watchdog | None = None
+        link.latches_errors = dialect is Dialect.GRBLHAL
         self._prepare()
 
     @property
@@ -135,10 +137,16 @@ class GrblStage:
         """
         if not self.laser_switchable:
             return
-        if not on and (self._link.in_motion or self._link.fault):
+        if on:
+            self._link.command(f"M3 S{self._params.laser_s:g}")
+        elif self._link.in_motion or self._link.fault:
             self._link.stop()  # M5 would wait for the end of the way, and be refused in an alarm; a reset is obeyed
         else:
-            self._link.command(f"M3 S{self._params.laser_s:g}" if on else "M5")
+            try:
+                self._link.command("M5")
+            except StageError as error:  # an alarm nobody has told of yet
+                logger.warning("%s, so the laser is switched off by a reset", error)
+                self._link.stop()
 
     def home(self) -> float:
         """Find `home_deg` as `[stage] homing` says and return the bearing reported [rad].
@@ -150,9 +158,9 @@ class GrblStage:
         """
         if self._link.fault:
             self._link.reset()  # a board that a limit switch stopped hears nothing else
+            self._link.fault = None
         if self._params.homing == "switch":
-            single = self.dialect is not Dialect.GRBL
-            self._link.command("$HX" if single else "$H", despite_fault=True, silence_s=HOMING_S)
+            self._seek_switch()
         else:
             self._unlock()
         self._link.fault = None
@@ -172,13 +180,15 @@ class GrblStage:
             self.laser(False)
             if self._link.in_motion:
                 self._link.stop()
-            self._release_motor()
+            if self.dialect.has_numbered_settings:  # the reset that follows lets the motor go
+                self._link.command(f"$1={idle_setting_afterwards(self._settings):g}", despite_fault=True)
         except StageError as error:
             logger.warning("%s was not shut down in order but told to reset (%s)", self._link.name, error)
         finally:
             try:
                 self._link.send_reset()
-                self._link.await_banner(FAREWELL_S)
+                if self._link.await_banner(FAREWELL_S) and not self.dialect.has_numbered_settings:
+                    self._link.command("$MD", despite_fault=True)  # before the reset it would be undone by it
             except StageError:
                 logger.warning("%s is gone: switch the laser off by hand", self._link.name)
             self._link.close()
@@ -210,6 +220,14 @@ class GrblStage:
             raise StageError(self._link.fault or f"stage {self._link.name} stays in alarm: check its limit switches")
         self._link.fault = None
 
+    def _seek_switch(self) -> None:
+        alone = self.dialect is Dialect.FLUIDNC or (
+            self.dialect is Dialect.GRBLHAL and bool(int(self._settings.get("22", 0.0)) & 2)
+        )
+        self._link.command("$HX" if alone else "$H", despite_fault=True, silence_s=HOMING_S)
+        if self._status().state == "Alarm":  # grbl says ok although it found no switch
+            raise StageError(self._link.fault or f"stage {self._link.name} could not home")
+
     def _find_index(self) -> float:
         """Turn toward smaller bearings until the probe input sees the mark; the board's X of the mark."""
         travel = self._params.direction * (self._params.max_deg - self._params.min_deg)
@@ -219,7 +237,7 @@ class GrblStage:
         found = next(filter(None, map(protocol.parse_probe, answers)), None)
         if found is None:
             raise StageError(f"stage {self._link.name} did not say where the index mark is: check the probe input")
-        return found
+        return self._in_deg(found)
 
     def _go(self, target_deg: float) -> float:
         """Move, prove the arrival, and return the bearing reported [deg]."""
@@ -232,7 +250,8 @@ class GrblStage:
             self._link.in_motion = False
             here = self._where_deg()
             step = 1.0 / self._settings["100"] if self._settings.get("100") else STEP_DEG_UNKNOWN
-            if abs(here - target_deg) <= step + REPORT_DEG:
+            report = REPORT_INCH_DEG if self._settings.get("13") else REPORT_DEG
+            if abs(here - target_deg) <= step + report:
                 return here
         raise StageError(
             f"stage {self._link.name} was asked for {target_deg:g} deg and stands at {here:g}: check for a blocked "
@@ -263,17 +282,12 @@ class GrblStage:
         x = status.position[0]
         if status.is_work and self._work_offset:
             x += self._work_offset[0]
-        if self._settings.get("13"):  # reports in inches
-            x *= 25.4
+        x = self._in_deg(x)
         steps = self._settings.get("100")
         return round(x * steps) / steps if steps else x
 
-    def _release_motor(self) -> None:
-        if not self.dialect.has_numbered_settings:
-            self._link.command("$MD", despite_fault=True)
-            return
-        # The reset that follows lets the motor go.
-        self._link.command(f"$1={idle_setting_afterwards(self._settings):g}", despite_fault=True)
+    def _in_deg(self, reported: float) -> float:
+        return reported * 25.4 if self._settings.get("13") else reported  # $13 makes degrees "inches" too
 
 
 def open_grbl(params: StageParams) -> GrblStage:

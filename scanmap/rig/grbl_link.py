@@ -38,6 +38,7 @@ class GrblLink:
         self._answered = True  # False while a line is out; stays so if the caller was interrupted
         self.in_motion = False  # True between the start of a turn and its arrival
         self.preamble: list[str] = []  # sent after every reset that was asked for
+        self.latches_errors = False  # grblHAL: after an error it refuses all G-code until it hears an empty line
         self.fault: str | None = None  # why commands are refused: position lost, alarm
 
     @property
@@ -71,6 +72,8 @@ class GrblLink:
             self._answered = True
             if answer == "ok":
                 return information
+            if answer and self.latches_errors:
+                self._clear_error()
             if answer and answer == refusal:
                 break
             refusal = answer or f"no ok for {line!r}"
@@ -144,6 +147,12 @@ class GrblLink:
         """Free the port; never raises."""
         self._port.close()
 
+    def _clear_error(self) -> None:
+        self._answered = False
+        self._port.write_line("")
+        self._await_answer(self._patience_s, despite_fault=True)
+        self._answered = True
+
     def _await_rest(self) -> None:
         deadline = time.monotonic() + max(self._patience_s, STILL_S)
         while time.monotonic() < deadline:
@@ -163,9 +172,9 @@ class GrblLink:
                 return "ok", information
             if line:
                 self._patience_s = self._timeout_s
-            code = protocol.parse_code(line) if line else None
-            if code and code[0] == "error":
-                return protocol.explain(*code), information
+            refusal = protocol.parse_error(line) if line else None
+            if refusal:
+                return refusal, information
             if line is not None:
                 status = self._note(line)
                 if self.fault and not despite_fault:
@@ -184,14 +193,15 @@ class GrblLink:
         code = protocol.parse_code(line)
         if code and code[0] == "ALARM":
             self.fault = f"stage {self.name} stopped with {protocol.explain(*code)}"
-        elif protocol.parse_banner(line):
+        elif protocol.parse_banner(line) and not self.fault:  # after a failed homing the board restarts too
             self.fault = (
                 f"stage {self.name} restarted by itself, so its position is lost: check its power supply, "
                 "then `scanmap stage home`"
             )
         status = protocol.parse_status(line)
         if status and status.state == "Alarm" and not self.fault:
-            self.fault = f"stage {self.name} is in alarm: `scanmap stage home`"
+            words = protocol.explain("ALARM", status.substate) if status.substate else "alarm: `scanmap stage home`"
+            self.fault = f"stage {self.name} is in {words}"
         return status
 
     def _silence(self) -> str:
@@ -211,7 +221,7 @@ class _Wait:
         self._silence_s = silence_s
         self._heard = self._polled = self._moved = now
         self._position: tuple[float, ...] | None = None
-        self._resting_reports = 0
+        self._unanswered_polls = self._resting_reports = 0
         self._resumed = False
 
     def is_silent(self) -> bool:
@@ -222,6 +232,7 @@ class _Wait:
         if now - self._polled < self._poll_s:
             return False
         self._polled = now
+        self._unanswered_polls += 1
         return True
 
     def is_over(self, status: Status, port: SerialPort) -> bool:
@@ -233,7 +244,11 @@ class _Wait:
         now = self._heard = time.monotonic()
         if status.position != self._position:
             self._position, self._moved = status.position, now
-        self._resting_reports = 0 if status.state in BUSY_STATES else self._resting_reports + 1
+        if status.state in BUSY_STATES:
+            self._resting_reports = 0
+        elif self._unanswered_polls:  # a report that the board sends by itself can be older than the line
+            self._resting_reports += 1
+        self._unanswered_polls = 0
         if status.state in ("Hold", "Door") and status.substate == 0:
             if self._resumed:
                 raise StageError(

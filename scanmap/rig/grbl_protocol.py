@@ -1,7 +1,8 @@
 """What GRBL boards say, read into values: banner, status report, settings, errors and alarms in words.
 
 Pure functions of one line of text; noise gives `None`, never an exception. Covers grbl 1.1, grblHAL and
-FluidNC. Source: gnea/grbl, doc/markdown/interface.md and doc/csv; the two others add codes to them.
+FluidNC. Source: gnea/grbl, doc/markdown/interface.md and doc/csv; grblHAL/core, errors.c and alarms.c;
+bdring/FluidNC, Channel.cpp and Report.cpp.
 """
 
 from __future__ import annotations
@@ -52,6 +53,13 @@ ERRORS = {
     33: "the target is invalid",
     36: "a word is not used",
     38: "the tool number is too large",
+    45: "a limit switch is held: turn the head off it by hand",
+    46: "the board must be homed first: stage.homing = 'switch', or switch off its homing lock ($22)",
+    50: "the emergency stop is pressed: release it",
+    51: "a motor driver reports a fault: check its power, heat and wiring",
+    52: "a setting is out of the board's range",
+    53: "the board has no such setting",
+    79: "the board is halted by an alarm: `scanmap stage home`",
 }
 
 ALARMS = {
@@ -67,8 +75,11 @@ ALARMS = {
     10: "the emergency stop is pressed: release it, then `scanmap stage home`",
     11: "the board must be homed first: `scanmap stage home`",
     12: "a limit switch is held: turn the head off it by hand",
-    14: "the board's laser output did not answer: check its configuration",
+    13: "the probe input was touched: free it, then `scanmap stage home`",
+    14: "the board's laser output did not answer, or it must be homed first: check its configuration",
+    16: "the board's own test failed: switch it off and on",
     17: "a motor driver reports a fault: check its power, heat and wiring",
+    18: "homing is set up wrongly on the board: check $22 to $27 and $44",
 }
 
 
@@ -104,7 +115,7 @@ class Status(NamedTuple):
 
 _BANNER = re.compile(r"\bGrbl(?P<hal>HAL)? (?P<version>[\d.]+\w*) ?\[(?P<rest>[^\]]*)")
 _CODE = re.compile(r"(?P<kind>error|ALARM): ?(?P<code>\d+)$")
-_SETTING = re.compile(r"\$(?P<name>[\w/]+)=(?P<value>-?\d+(\.\d+)?)\b")
+_SETTING = re.compile(r"\$(?P<name>[\w/]+)=(?P<value>-?\d+(\.\d+)?)(?=$|\s)")
 _STATES = {"Idle", "Run", "Jog", "Hold", "Door", "Home", "Alarm", "Check", "Sleep", "Tool"}
 
 
@@ -144,6 +155,14 @@ def parse_code(line: str) -> tuple[str, int] | None:
     """`("error", 9)` or `("ALARM", 1)`."""
     match = _CODE.match(line)
     return (match["kind"], int(match["code"])) if match else None
+
+
+def parse_error(line: str) -> str | None:
+    """A refusal in words; FluidNC says its own instead of a number where `verbose_errors` is set."""
+    code = parse_code(line)
+    if code:
+        return explain(*code) if code[0] == "error" else None
+    return line if line.startswith("error:") else None
 
 
 def parse_setting(line: str) -> tuple[str, float] | None:

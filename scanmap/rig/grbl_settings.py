@@ -37,17 +37,18 @@ def idle_setting_afterwards(settings: dict[str, float]) -> float:
 
 def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
     """Write only what differs: the board's memory wears out."""
-    settings = dict(filter(None, map(parse_setting, link.command("$$"))))
+    # A board that waits for its homing is in alarm, and takes settings all the same.
+    settings = dict(filter(None, map(parse_setting, link.command("$$", despite_fault=True))))
     wanted = {"100": params.steps_per_deg, "120": params.acceleration_deg_s2, "1": HOLD_FOREVER}
     feed = params.speed_deg_s * 60
     if settings.get("110", feed) < feed:
         wanted["110"] = feed
-    if params.laser == "grbl":
+    if params.laser == "grbl" and "32" in settings:  # some builds know no laser mode
         wanted["32"] = 0.0
     for number, value in wanted.items():
         if value is None or math.isclose(settings.get(number, math.nan), value, abs_tol=6e-4):
             continue
-        link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."))
+        link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."), despite_fault=True)
         if number != "1":
             settings[number] = value
     return settings
@@ -55,7 +56,8 @@ def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
 
 def _compare_yaml(link: GrblLink, params: StageParams) -> dict[str, float]:
     """FluidNC keeps its machine in a file: compare, and say what to change there."""
-    settings = {}
+    inches = _yaml_value(link, "13")  # the one of grbl's numbers that every version answers
+    settings = {} if inches is None else {"13": inches}
     steps = _yaml_value(link, "/axes/x/steps_per_mm")
     wanted = params.steps_per_deg
     if steps is not None:
@@ -73,7 +75,7 @@ def _compare_yaml(link: GrblLink, params: StageParams) -> dict[str, float]:
 
 def _yaml_value(link: GrblLink, path: str) -> float | None:
     try:
-        answers = link.command(f"${path}")
+        answers = link.command(f"${path}", despite_fault=True)
     except StageError:
         return None
     found = [setting for setting in map(parse_setting, answers) if setting and setting[0] == path]

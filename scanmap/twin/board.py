@@ -36,6 +36,7 @@ _DEFAULTS: dict[int, float] = {
 }
 _THREE_DECIMALS = {11, 12, 24, 25, 27} | {number for number in _DEFAULTS if number >= 100}
 _FLAGS = {4, 5, 6, 13, 20, 21, 22, 32}
+HOMING, HOMING_ONE_AXIS, HOMING_FIRST = 1, 2, 4  # bits of $22; the last two are grblHAL's
 
 
 @dataclass
@@ -56,7 +57,7 @@ class Memory:
             for number, value in self.settings.items()
         ]
 
-    def store(self, number: int, value: float) -> int:
+    def store(self, number: int, value: float, dialect: DialectName = "grbl") -> int:
         """Write a setting; returns grbl's error number, 0 if it was taken."""
         if value < 0:
             return 4
@@ -66,7 +67,7 @@ class Memory:
             return 6
         if number == 20 and value and not self.settings[22]:
             return 10
-        if number in _FLAGS:
+        if number in _FLAGS and not (number == 22 and dialect == "grblHAL"):
             value = float(bool(value))
         elif number not in _THREE_DECIMALS:
             value = float(int(value))
@@ -118,18 +119,20 @@ class StatusReport(NamedTuple):
         """As `$10` and `$13` want it; offset and overrides come with some reports only, as on the real board."""
         mask = int(settings[10])
         inch = 25.4 if settings[13] else 1.0
+        in_inches = bool(settings[13])
         fields = [f"{self.state}:{int(self.braking)}" if self.state == "Hold" else self.state]
         place = self.position - (0 if mask & 1 else self.offset)
-        fields.append(("MPos:" if mask & 1 else "WPos:") + _triple(place / inch))
+        fields.append(("MPos:" if mask & 1 else "WPos:") + triple(place, in_inches))
         if mask & 2:
             fields.append(f"Bf:{self.free[0]},{self.free[1]}")
         fields.append(f"FS:{self.speed * 60 / inch:.0f},{self.laser_power:.0f}")
         if with_offset:
-            fields.append("WCO:" + _triple(self.offset / inch))
+            fields.append("WCO:" + triple(self.offset, in_inches))
         elif with_overrides:
             fields.append("Ov:100,100,100" + ("|A:S" if self.laser_power else ""))
         return f"<{'|'.join(fields)}>"
 
 
-def _triple(values: NDArray[np.float64]) -> str:
-    return ",".join(f"{value:.3f}" for value in values)
+def triple(values: NDArray[np.float64], in_inches: bool) -> str:
+    """Three coordinates [units] as the board writes them: three decimals, or four of inches."""
+    return ",".join(f"{value / 25.4:.4f}" if in_inches else f"{value:.3f}" for value in values)

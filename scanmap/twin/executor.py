@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.twin.board import Modes
+from scanmap.twin.board import Modes, triple
 from scanmap.twin.gcode import GcodeError, Words, read_words
 from scanmap.twin.system_commands import Answer, SystemCommands, Wait
 
@@ -29,6 +29,8 @@ class Executor:
         self._board = board
         self.modes = Modes()
         self.laser_power = 0.0  # S word while M3 or M4 is on
+        self.probed, self.probe_closed = np.zeros(3), False
+        self._last_error = 0
         self._system = SystemCommands(board, self)
         self.apply_steps()
 
@@ -46,13 +48,18 @@ class Executor:
     def execute(self, line: str) -> Answer:
         """Carry out one line, stripped and in upper case."""
         board = self._board
-        if not line:
-            return 0
         if line.startswith("$"):
-            return (yield from self._system.execute(line[1:]))
-        if board.alarm or board.planner.jogging:
-            return 9
-        return (yield from self._gcode(line))
+            error = yield from self._system.execute(line[1:])
+        elif not line:
+            error = 0
+        elif board.alarm or board.planner.jogging:
+            error = 9
+        elif self._last_error and board.dialect == "grblHAL":  # until an empty line or one with a $
+            error = self._last_error
+        else:
+            error = yield from self._gcode(line)
+        self._last_error = error
+        return error
 
     def apply_steps(self) -> None:
         """`$100` to `$102` have changed."""
@@ -101,7 +108,7 @@ class Executor:
             yield from self.synchronise()
             self.laser_power = 0.0
             self.modes = Modes()
-            self._board.say("[MSG:Pgm End]")
+            self._board.message("Program End" if self._board.dialect == "FluidNC" else "Pgm End")
         return 0
 
     def _scale(self, words: Words) -> float:
@@ -222,7 +229,12 @@ class Executor:
         found = mark is not None and min(start[0], target[0]) <= mark <= max(start[0], target[0])
         self.plan(np.array([mark, *start[1:]]) if found else target, feed, is_jog=False)
         yield from self.synchronise()
-        x, y, z = board.planner.position()
-        board.say(f"[PRB:{x:.3f},{y:.3f},{z:.3f}:{int(found)}]")
+        self.probed, self.probe_closed = board.planner.position(), found
         if not found:
             board.raise_alarm(5)
+        board.say(self.probe_report())
+
+    def probe_report(self) -> str:
+        """Where the last probing ended and whether the input closed."""
+        place = triple(self.probed, bool(self._board.memory.settings[13]))
+        return f"[PRB:{place}:{int(self.probe_closed)}]"

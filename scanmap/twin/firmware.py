@@ -15,16 +15,17 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass, field
 
-from scanmap.twin.board import BANNERS, DialectName, Memory, StatusReport
+from scanmap.twin.board import BANNERS, HOMING, HOMING_FIRST, DialectName, Memory, StatusReport
 from scanmap.twin.executor import Executor
 from scanmap.twin.motion import Drivetrain
 from scanmap.twin.planner import Planner
 from scanmap.twin.serial_line import Faults, SerialLine
 
-RX_BYTES = {"grbl": 128, "grblHAL": 1024, "FluidNC": 256}
+RX_BYTES = {"grbl": 128, "grblHAL": 1023, "FluidNC": 256}
 LINE_CHARACTERS = 79
 
 _CRITICAL_ALARMS = {1, 2}  # these halt the board until it is reset
+_DEAD_STOPS = {1, 3}  # in mid-way: these let the motor go even where $1 is 255
 
 
 @dataclass
@@ -113,8 +114,10 @@ class Firmware:
         self._executor.laser_power = 0.0
         self.alarm = True
         self.say(f"ALARM:{code}")
+        if code in _DEAD_STOPS:
+            self.release_motor()
         if code in _CRITICAL_ALARMS:
-            self.say("[MSG:Reset to continue]")
+            self.message("Reset to continue")
             self._halted = True
 
     def wait(self, seconds: float) -> None:
@@ -157,6 +160,10 @@ class Firmware:
         """Send a line to the host."""
         self._line.send(line, self._now)
 
+    def message(self, text: str) -> None:
+        """Tell the host something it did not ask for."""
+        self.say(f"[MSG:{'INFO: ' if self.dialect == 'FluidNC' else ''}{text}]")
+
     def go_idle(self) -> None:
         """Motion has ended: the motor lets go unless `$1` is 255."""
         self._motor_on = self.memory.settings[1] == 255
@@ -173,7 +180,8 @@ class Firmware:
     def _power_up(self) -> None:
         self.planner = Planner(self.drivetrain)
         self.drivetrain.recount(0)
-        self.alarm = self.memory.settings[22] == 1  # not homed yet
+        must_home = HOMING_FIRST if self.dialect == "grblHAL" else HOMING
+        self.alarm = self.must_home = bool(int(self.memory.settings[22]) & must_home)
         self._restart()
 
     def _restart(self) -> None:
@@ -189,8 +197,11 @@ class Firmware:
         """The board's main loop; yields the time before which it has nothing to do."""
         self.say("")
         self.say(BANNERS[self.dialect])
-        if self.alarm:
-            self.say("[MSG:'$H'|'$X' to unlock]")
+        if self.alarm and self.must_home and self.dialect == "grblHAL":
+            self.say("ALARM:11")
+            self.message("Homing cycle required")
+        elif self.alarm:
+            self.message("'$H'|'$X' to unlock")
         else:
             yield from self._executor.run_startup()
         while True:
@@ -200,6 +211,9 @@ class Firmware:
                 continue
             answer = 11 if len(line) > LINE_CHARACTERS else (yield from self._executor.execute(line))
             self.say(f"error:{answer}" if answer else "ok")
+            if self.asleep:
+                self.message("Sleeping")
+                self.release_motor()
             if self.restart_requested:
                 self._restart()
                 yield self._now  # the new life begins at once
@@ -280,7 +294,7 @@ class Firmware:
 
     def _report(self) -> None:
         """The answer to `?`."""
-        if self._halted:
+        if self._halted and self.dialect == "grbl":
             return
         if self.faults.lose_status > 0:
             self.faults.lose_status -= 1

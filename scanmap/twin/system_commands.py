@@ -1,16 +1,19 @@
 """What the twin's board does with a line that begins with `$`: settings, reports, unlock, sleep, homing.
 
-Source: gnea/grbl, doc/markdown/commands.md, settings.md. Lines that must wait are generators: they yield the
-time before which nothing will happen.
+Source: gnea/grbl, doc/markdown/commands.md, settings.md, grbl/system.c; grblHAL/core, system.c.
+Lines that must wait are generators: they yield the time before which nothing will happen.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
-from scanmap.twin.board import BUILD_INFO
+import numpy as np
+
+from scanmap.twin.board import BUILD_INFO, HOMING, HOMING_ONE_AXIS, triple
 
 if TYPE_CHECKING:
     from scanmap.twin.executor import Executor
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 Wait = Generator[float, None, None]
 Answer = Generator[float, None, int]  # grbl's error number, 0 for ok
 
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
 _SEARCH = 1.5  # homing looks as far as this times $130
 
 
@@ -38,34 +42,47 @@ class SystemCommands:
             return (yield from self._executor.jog(command[2:]))
         anytime: dict[str, Callable[[], None]] = {
             "": self._help,
-            "X": self._unlock,
             "G": lambda: board.say(self._executor.modes.line()),
         }
         if command in anytime:
             anytime[command]()
             return 0
-        if board.planner.busy:
+        if command == "X":
+            return self._unlock()
+        if board.planner.busy or (board.checking and command not in ("$", "C")):
             return 8
         if command == "H" or (command == "HX" and board.dialect != "grbl"):
-            return (yield from self._home())
+            return (yield from self._home(alone=command == "HX"))
         return self._idle_command(command)
 
     def _help(self) -> None:
         self._board.say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
 
-    def _unlock(self) -> None:
-        if self._board.alarm:
-            self._board.say("[MSG:Caution: Unlocked]")
-            self._board.alarm = False
+    def _unlock(self) -> int:
+        board = self._board
+        if board.alarm and board.must_home and board.dialect == "grblHAL":
+            return 46
+        if board.alarm:
+            board.message("Caution: Unlocked")
+            board.alarm = False
+        return 0
+
+    def _parameters(self) -> list[str]:
+        """The answer to `$#`."""
+        executor, in_inches = self._executor, bool(self._board.memory.settings[13])
+        zero = [0.0, 0.0, 0.0]
+        places = {**self._board.memory.offsets, "G28": zero, "G30": zero, "G92": executor.modes.g92}
+        tool = "0.0000" if in_inches else "0.000"
+        lines = [f"[{name}:{triple(np.asarray(place), in_inches)}]" for name, place in places.items()]
+        return [*lines, f"[TLO:{tool}]", executor.probe_report()]
 
     def _idle_command(self, command: str) -> int:
         """Commands that need a board at rest."""
         board, memory = self._board, self._board.memory
-        offsets = {**memory.offsets, "G92": self._executor.modes.g92}
         reports = {
             "I": BUILD_INFO[board.dialect],
             "N": [f"$N{number}={line}" for number, line in enumerate(memory.startup)],
-            "#": [f"[{name}:{x:.3f},{y:.3f},{z:.3f}]" for name, (x, y, z) in offsets.items()],
+            "#": self._parameters(),
         }
         if board.dialect != "FluidNC":
             reports["$"] = memory.lines()
@@ -73,6 +90,8 @@ class SystemCommands:
             board.say(line)
         if command in reports:
             return 0
+        if board.alarm and (command == "C" or command[:3] in ("N0=", "N1=")):
+            return 8
         if command[:3] in ("N0=", "N1="):
             memory.startup[int(command[1])] = command[3:]
             memory.writes += 1
@@ -81,7 +100,7 @@ class SystemCommands:
             self._executor.laser_power = 0.0
         elif command == "C":
             board.checking = not board.checking
-            board.say("[MSG:Enabled]" if board.checking else "[MSG:Disabled]")
+            board.message("Enabled" if board.checking else "Disabled")
             board.restart_requested = not board.checking
         else:
             return self._fluidnc(command) if board.dialect == "FluidNC" else self._store(command)
@@ -96,7 +115,10 @@ class SystemCommands:
             "/stepping/idle_ms": f"{settings[1]:.0f}",
         }
         if command == "MD":
+            board.message("Disabling all motors")
             board.release_motor()
+        elif command == "13":
+            board.say(f"$13={settings[13]:.0f}")
         elif command.lower() in tree:
             board.say(f"${command.lower()}={tree[command.lower()]}")
         else:
@@ -104,19 +126,28 @@ class SystemCommands:
         return 0
 
     def _store(self, command: str) -> int:
-        name, equals, text = command.partition("=")
-        try:
-            number, value = int(name), float(text)
-        except ValueError:
-            return 2 if name.isdigit() and equals else 3
-        error = self._board.memory.store(number, value)
+        dialect = self._board.dialect
+        number = _NUMBER.match(command)
+        if not number:  # grbl takes every unknown letter for a setting whose number is missing
+            return 2 if dialect == "grbl" and command[0] not in "$GCXJ#HSIR" else 3
+        rest = command[number.end() :]
+        if not rest.startswith("="):
+            return 3
+        value = _NUMBER.match(rest, 1)
+        if not value:
+            return 2
+        if value.end() != len(rest) or float(number[0]) > 255:
+            return 3
+        error = self._board.memory.store(int(float(number[0])), float(value[0]), dialect)
         self._executor.apply_steps()
         return error
 
-    def _home(self) -> Answer:
+    def _home(self, *, alone: bool) -> Answer:
         """Seek the switch, back off, and name the place. Silent meanwhile, as the real one is."""
         board, settings = self._board, self._board.memory.settings
-        if not settings[22]:
+        if not int(settings[22]) & HOMING:
+            return 5
+        if alone and board.dialect == "grblHAL" and not int(settings[22]) & HOMING_ONE_AXIS:
             return 5
         board.homing, board.alarm = True, False
         toward = -1.0 if int(settings[23]) & 1 else 1.0
@@ -132,6 +163,7 @@ class SystemCommands:
             board.restart_requested = True
             return 0
         place = -settings[27] if toward > 0 else settings[27] - settings[130]
+        board.must_home = False
         board.planner.set_counter(0, round(place * settings[100]))
         board.go_idle()
         yield from self._executor.run_startup()
