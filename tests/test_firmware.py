@@ -63,6 +63,9 @@ def test_banner_on_power_up_and_after_reset() -> None:
         ("$J=X10", 22),
         ("$J=G0X10F100", 16),
         ("G7", 20),
+        ("M7", 20),  # not built in
+        ("G1.5 X1 F10", 23),
+        ("M3.5", 23),
         ("A10", 20),
         ("G0 G1 X1", 21),
         ("G1 X1", 22),
@@ -117,6 +120,26 @@ def test_what_an_alarm_and_the_check_mode_lock(board: Firmware) -> None:
         "error:8",
         "ok",
     ]
+
+
+def test_only_a_change_of_m3_or_s_reaches_the_laser(board: Firmware) -> None:
+    assert say(board, "M3 S500") == ["ok"]
+    assert board.laser_on
+    say(board, "$30=2000")
+    assert not board.laser_on
+    say(board, "M3 S500")
+    assert not board.laser_on
+    say(board, "S600")
+    assert board.laser_on
+    board.write(b"M5\nG1 X90 F600\nM5\n")
+    assert board.read(100) == b"ok\r\n" * 3  # the second M5 has nothing to wait for
+
+
+def test_program_end_keeps_units_speed_and_feed(board: Firmware) -> None:
+    say(board, "G20 G91 G55 F10 M3 S5")
+    assert say(board, "M2") == ["[MSG:Pgm End]", "ok"]
+    assert say(board, "$G")[0] == "[GC:G1 G54 G17 G20 G90 G94 M5 M9 T0 F254 S5]"
+    assert not board.laser_on
 
 
 def test_a_dead_stop_lets_the_motor_go_even_where_it_should_hold(board: Firmware) -> None:

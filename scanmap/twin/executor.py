@@ -90,7 +90,6 @@ class Executor:
         except GcodeError as error:
             return error.code
         self.modes.feed = feed
-        self.modes.speed = words.values.get("S", self.modes.speed)
         self.modes.tool = int(words.values.get("T", self.modes.tool))
         yield from self._switch_laser(words)
         if words.codes.get("nonmodal") == "G4":
@@ -107,7 +106,9 @@ class Executor:
         if words.codes.get("stopping") in ("M2", "M30"):
             yield from self.synchronise()
             self.laser_power = 0.0
-            self.modes = Modes()
+            resting = Modes()
+            kept = {"units": self.modes.codes["units"], "motion": "G1"}
+            self.modes.codes = {**resting.codes, **kept}
             self._board.message("Program End" if self._board.dialect == "FluidNC" else "Pgm End")
         return 0
 
@@ -116,7 +117,10 @@ class Executor:
 
     def _switch_laser(self, words: Words) -> Wait:
         spindle = words.codes.get("spindle", self.modes.codes["spindle"])
-        changes = "spindle" in words.codes or ("S" in words.values and spindle != "M5")
+        speed = words.values.get("S", self.modes.speed)
+        # Only a change reaches the output: a second M3 does not light what a setting has switched off.
+        changes = spindle != self.modes.codes["spindle"] or (spindle != "M5" and speed != self.modes.speed)
+        self.modes.speed = speed
         if changes and not self._board.checking:
             yield from self.synchronise()
             limit = self._board.memory.settings[30]

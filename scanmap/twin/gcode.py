@@ -25,7 +25,7 @@ MODAL_GROUPS: dict[str, tuple[str, ...]] = {
     "path": ("G61",),
     "stopping": ("M0", "M1", "M2", "M30"),
     "spindle": ("M3", "M4", "M5"),
-    "coolant": ("M7", "M8", "M9"),
+    "coolant": ("M8", "M9"),
 }
 _GROUP_OF = {code: group for group, codes in MODAL_GROUPS.items() for code in codes}
 _WITH_AXES = {"G10", "G92"}
@@ -75,8 +75,8 @@ def read_words(line: str) -> Words:
         if letter in "GM":
             code = f"{letter}{number:g}"
             group = _GROUP_OF.get(code)
-            if group is None:
-                raise GcodeError(20)
+            if group is None:  # G1.5 is not whole, G7 is unknown
+                raise GcodeError(23 if number % 1 and f"{letter}{int(number)}" in _GROUP_OF else 20)
             if code == "G53":
                 g53 = True
             elif group in codes:

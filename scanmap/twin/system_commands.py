@@ -23,6 +23,7 @@ Wait = Generator[float, None, None]
 Answer = Generator[float, None, int]  # grbl's error number, 0 for ok
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
+_SPINDLE_SETTINGS = {30, 31, 32}  # writing them starts the output anew, switched off
 _SEARCH = 1.5  # homing looks as far as this times $130
 
 
@@ -140,6 +141,8 @@ class SystemCommands:
             return 3
         error = self._board.memory.store(int(float(number[0])), float(value[0]), dialect)
         self._executor.apply_steps()
+        if int(float(number[0])) in _SPINDLE_SETTINGS and not error:
+            self._executor.laser_power = 0.0
         return error
 
     def _home(self, *, alone: bool) -> Answer:
