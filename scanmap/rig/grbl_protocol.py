@@ -71,7 +71,7 @@ ALARMS = {
     6: "homing was interrupted: home again",
     7: "the safety door opened while homing: close it and home again",
     8: "the limit switch did not release: raise $27 or check its wiring",
-    9: "the limit switch was not found: check its wiring, $23 and $130",
+    9: "the limit switch was not found: check its wiring, $23, $130, and that the board homes X alone (docs/wiring.md)",
     10: "the emergency stop is pressed: release it, then `scanmap stage home`",
     11: "the board must be homed first: `scanmap stage home`",
     12: "a limit switch is held: turn the head off it by hand",
