@@ -275,7 +275,8 @@ class StreamCamera:
                     wanted, self._wanted_us = self._wanted_us, None
                     self._source.expose(wanted)
                 picture = self._source.read()
-            except CameraError as error:
+            except Exception as raised:  # a driver's own fault too is the camera's, and no thread may die in silence
+                error = raised if isinstance(raised, CameraError) else CameraError(f"camera {self.name}: {raised!r}")
                 self._source.close()
                 is_open = False
                 with self._news:
