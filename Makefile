@@ -24,6 +24,7 @@ test: $(VENV)/.installed-dev
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow
 
+# SCANMAP_RIG=my-rig.toml make test-hardware: turns that head by 10 deg, its laser on. Stay beside it.
 test-hardware: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m hardware
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -81,7 +82,10 @@ def camera(
             yield rig.rig.camera
             return
         if kind == "real":
-            yield stack.enter_context(opened(CameraParams()))
+            from scanmap.config import load
+
+            named = os.environ.get("SCANMAP_RIG")
+            yield stack.enter_context(opened(load(named).camera if named else CameraParams()))
             return
         if kind in ("v4l2", "yuyv"):
             request.getfixturevalue("device").sends_jpeg = kind == "v4l2"
