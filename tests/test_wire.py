@@ -329,6 +329,25 @@ def test_fluidnc_that_reports_inches() -> None:
     finish(port)
 
 
+@pytest.mark.parametrize(("held", "reported"), [(4.444444, 180.0), (4.444, 180.018)])
+def test_steps_with_many_decimals_are_written_whole_and_counted_right(held: float, reported: float) -> None:
+    """1600 steps for a turn; grbl prints 4.444 whichever it holds, and 800 steps are half a turn."""
+    assert 800 / held == pytest.approx(reported, abs=5e-4)
+    new = [pair if pair[0] != b"$100=80\n" else (b"$100=4.444444\n", OK) for pair in OPEN_GRBL]
+    old = [(b"?", at(0)), (b"$$\n", (SETTINGS_22 % 0).replace(b"80.000", b"4.444")), PREAMBLE, (b"M5\n", OK)]
+    for opening in (new, old):
+        stage, port = play([*opening, *move(180.0, reported)], steps_per_deg=1600 / 360)
+        assert stage.move_to(math.pi) == pytest.approx(math.pi, abs=1e-12)
+        finish(port)
+
+
+def test_a_board_whose_steps_nobody_says_is_taken_at_its_word_where_they_are_rounded() -> None:
+    opening = [(b"?", at(0)), (b"$$\n", (SETTINGS_22 % 0).replace(b"80.000", b"8.889")), PREAMBLE, (b"M5\n", OK)]
+    stage, port = play([*opening, *move(180.0)], steps_per_deg=None)
+    assert stage.move_to(math.pi) == math.pi  # 1600 steps of 8.889 would be 179.998
+    finish(port)
+
+
 def test_the_index_mark_is_where_the_probe_says_also_in_inches() -> None:
     inches = OPEN_GRBL[1][1].replace(b"$13=0", b"$13=1")
     place = b"<Idle|MPos:-1.0000,0.0000,0.0000|FS:0,0>\r\n"

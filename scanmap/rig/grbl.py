@@ -237,7 +237,7 @@ class GrblStage:
         found = next(filter(None, map(protocol.parse_probe, answers)), None)
         if found is None:
             raise StageError(f"stage {self._link.name} did not say where the index mark is: check the probe input")
-        return self._in_deg(found)
+        return self._whole_steps(found)
 
     def _go(self, target_deg: float) -> float:
         """Move, prove the arrival, and return the bearing reported [deg]."""
@@ -250,8 +250,7 @@ class GrblStage:
             self._link.in_motion = False
             here = self._where_deg()
             step = 1.0 / self._settings["100"] if self._settings.get("100") else STEP_DEG_UNKNOWN
-            report = REPORT_INCH_DEG if self._settings.get("13") else REPORT_DEG
-            if abs(here - target_deg) <= step + report:
+            if abs(here - target_deg) <= step + self._report_deg:
                 return here
         raise StageError(
             f"stage {self._link.name} was asked for {target_deg:g} deg and stands at {here:g}: check for a blocked "
@@ -278,16 +277,30 @@ class GrblStage:
         return status
 
     def _machine_deg(self, status: Status) -> float:
-        """The board's X [deg], rounded to the whole motor step that it stands for."""
+        """The board's X [deg]."""
         x = status.position[0]
         if status.is_work and self._work_offset:
             x += self._work_offset[0]
-        x = self._in_deg(x)
-        steps = self._settings.get("100")
-        return round(x * steps) / steps if steps else x
+        return self._whole_steps(x)
 
-    def _in_deg(self, reported: float) -> float:
-        return reported * 25.4 if self._settings.get("13") else reported  # $13 makes degrees "inches" too
+    @property
+    def _report_deg(self) -> float:
+        return REPORT_INCH_DEG if self._settings.get("13") else REPORT_DEG
+
+    def _whole_steps(self, reported: float) -> float:
+        """A reported X [deg] as the whole motor step that it stands for.
+
+        A board tells `$100` with three decimals (4.444 for 4.44444), whatever it counts with. That is enough to
+        know the step; where the rig says how many make a degree, the rig is believed.
+        """
+        x = reported * 25.4 if self._settings.get("13") else reported  # $13 makes degrees "inches" too
+        told = self._settings.get("100")
+        if not told:
+            return x
+        count = round(x * told)
+        if self._params.steps_per_deg:
+            return count / self._params.steps_per_deg
+        return count / told if abs(count / told - x) <= self._report_deg else x
 
 
 def open_grbl(params: StageParams) -> GrblStage:

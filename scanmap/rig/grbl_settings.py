@@ -48,7 +48,7 @@ def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
     for number, value in wanted.items():
         if value is None or math.isclose(settings.get(number, math.nan), value, abs_tol=6e-4):
             continue
-        link.command(f"${number}={value:.3f}".rstrip("0").rstrip("."), despite_fault=True)
+        link.command(f"${number}={value:.6f}".rstrip("0").rstrip("."), despite_fault=True)
         if number != "1":
             settings[number] = value
     return settings
@@ -62,7 +62,7 @@ def _compare_yaml(link: GrblLink, params: StageParams) -> dict[str, float]:
     wanted = params.steps_per_deg
     if steps is not None:
         settings["100"] = steps
-        if wanted is not None and not math.isclose(steps, wanted, rel_tol=1e-4):
+        if wanted is not None and not math.isclose(steps, wanted, rel_tol=1e-4, abs_tol=6e-4):
             raise StageError(
                 f"stage {link.name}: axes/x/steps_per_mm is {steps:g} in the board's config.yaml, "
                 f"stage.steps_per_deg is {wanted:g}: make them equal"
@@ -78,5 +78,6 @@ def _yaml_value(link: GrblLink, path: str) -> float | None:
         answers = link.command(f"${path}", despite_fault=True)
     except StageError:
         return None
-    found = [setting for setting in map(parse_setting, answers) if setting and setting[0] == path]
+    told = filter(None, map(parse_setting, answers))  # early versions leave out the first slash
+    found = [setting for setting in told if setting[0].lstrip("/") == path.lstrip("/")]
     return found[0][1] if found else None
