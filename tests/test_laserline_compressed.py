@@ -83,3 +83,20 @@ def test_a_turned_picture_gives_the_line_of_its_copy():
     np.testing.assert_array_equal(
         find_laser_line(mirrored, POOLED).column_px, find_laser_line(np.ascontiguousarray(mirrored), POOLED).column_px
     )
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.6, 1.3])
+def test_a_saturated_upright_line_is_not_moved_by_smeared_colour(phase: float) -> None:
+    """Every row lies alike in the JPEG's blocks: what moves one row moves them all, and no pooling takes it out."""
+    column = np.full(400, 250.0 + phase)
+    light = 4.0 * np.exp(-0.5 * ((np.arange(500.0) - column[:, None]) / 1.9) ** 2)
+    rng = np.random.default_rng(3)
+    sensor = np.stack([share * light + 0.06 for share in (0.05, 0.12, 1.0)], axis=-1)
+    sensor += 0.01 * rng.standard_normal(sensor.shape)
+    pixels = np.clip(np.rint(255.0 * np.clip(sensor, 0, 1) ** (1 / 2.2)), 0, 255).astype(np.uint8)
+    options = [cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    image = cv2.imdecode(cv2.imencode(".jpg", pixels, options)[1], cv2.IMREAD_COLOR)
+    line = find_laser_line(np.asarray(image, np.uint8), LaserLineParams(pool_rows=9))
+    off = line.column_px - column
+    assert np.isfinite(off).mean() > 0.99
+    assert abs(np.nanmean(off)) < 0.02 and np.nanstd(off) < 0.03

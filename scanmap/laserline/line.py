@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import find_bars
+from scanmap.laserline.brightness import by_brightness
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
@@ -184,15 +185,17 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         y, usable = around.of(half, some)
         peaks = fit_gaussian(y, usable, noise, contrast, partial(around.of, some=some))
         contrast = peaks.contrast
-        offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         reason = _judged(peaks, noise, params)
+        peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some, noise)
+        offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         dim = (reason == Reason.WEAK) & (peaks.height >= params.min_peak) & (peaks.sigma_px < _DIM_PX)
         if dim.any():
             reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, reason == Reason.OK, dim)] = Reason.OK
         if params.method == "gauss":
             # A wide saturated line whose flanks are no Gaussian's stands in a halo.
             misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
-            reason[peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & (reason == Reason.OK)] = Reason.WIDE
+            halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & ~even
+            reason[halo & (reason == Reason.OK)] = Reason.WIDE
             final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
             lost = (reason != Reason.OK) & ~final
             _take_cores(line, (r[lost], c[lost]), y.T[lost], params.max_width_px, noise, params)

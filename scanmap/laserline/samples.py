@@ -25,6 +25,8 @@ _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 # Share of the laser's own channel in the mixture, and of its light that a neighbouring channel sees.
 _OWN, _SHARE = 0.7, 0.12
 _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
+# Share of a channel (blue, green, red) in what it and its neighbour have of brightness (BT.601's weights).
+_BRIGHTNESS = (0.16, 0.66, 0.34)
 
 
 class Samples(NamedTuple):
@@ -34,6 +36,7 @@ class Samples(NamedTuple):
     seen: U8  # of the picture, which says where it saturates
     beside: U8 | None  # of the neighbouring channel, where it knows more of the place; else None
     outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
+    channel: int = -1  # of the laser, where `beside` is known
 
     def of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
         """Samples (2 half + 1, n) of some rows, and 1 where they say more than "bright", else 0."""
@@ -45,6 +48,22 @@ class Samples(NamedTuple):
         if self.outside is not None:
             usable &= ~self.outside[span, some]
         return y, usable.astype(np.float32)
+
+    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
+        """The same in what JPEG stores as brightness; only where `beside` is known.
+
+        Where the laser's channel saturates, colour, smeared over two columns and more, moves what is decoded of its
+        flanks by up to a tenth of a pixel, in all rows of an upright line alike. Brightness is not smeared, and the
+        other channels in it do not saturate; a top cut flat is as even on both sides as a whole one.
+        """
+        span = slice(REACH - half, REACH + half + 1)
+        assert self.beside is not None
+        own, beside = self.lit[span, some].astype(np.float32), self.beside[span, some]
+        usable = beside < SATURATED
+        if self.outside is not None:
+            usable &= ~self.outside[span, some]
+        share = np.float32(_BRIGHTNESS[self.channel])
+        return own * share + beside * (np.float32(1.0) - share), usable.astype(np.float32)
 
 
 def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
@@ -60,7 +79,7 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
-    return Samples(y, bright, beside, outside)
+    return Samples(y, bright, beside, outside, sight.channel)
 
 
 def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_]) -> F32:
