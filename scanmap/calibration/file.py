@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import Any
 
@@ -63,7 +64,15 @@ def dumps(calibration: Calibration) -> str:
     for name in ("residuals", "covariance", "meta"):
         if getattr(calibration, name):
             document[name] = getattr(calibration, name)
-    return tomli_w.dumps(_plain(document))
+    return _NUMBERS.sub(_on_one_line, tomli_w.dumps(_plain(document)))
+
+
+# An array of numbers that the writer broke into a line each: nobody reads a matrix that way.
+_NUMBERS = re.compile(r"\[\n((?: +[-+0-9.e]+,\n)+) *\]")
+
+
+def _on_one_line(array: re.Match[str]) -> str:
+    return f"[{', '.join(array[1].replace(',', ' ').split())}]"
 
 
 def _with_tuples(document: dict[str, Any]) -> dict[str, Any]:

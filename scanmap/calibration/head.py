@@ -125,7 +125,8 @@ class Calibration:
         try:
             text = Path(path).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise CalibrationError(f"calibration {path} cannot be read: {error}") from error
+            why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+            raise CalibrationError(f"calibration {path} cannot be read: {why}") from error
         return cls.loads(text, source=str(path))
 
     @classmethod

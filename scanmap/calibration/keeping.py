@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
 import tempfile
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePath
 
 from scanmap.calibration.head import Calibration
 from scanmap.errors import CalibrationError, ConfigError
@@ -47,6 +49,36 @@ def save_beside(calibration: Calibration, path: Path) -> Path | None:
     except OSError as error:
         raise CalibrationError(f"calibration {path} cannot be written: {error.strerror or error}") from error
     return kept
+
+
+def existing(path: Path) -> Calibration | None:
+    """The calibration at `path`; None where there is none, or a damaged one (which is kept beside all the same)."""
+    try:
+        return Calibration.load(path) if path.is_file() else None
+    except CalibrationError:
+        return None
+
+
+def parts_lost(made: Calibration, path: Path) -> list[str]:
+    """What the calibration at `path` has and `made` has not, in words; `made` is about to take its place."""
+    old = existing(path)
+    missing = list(made.meta.get("uncalibrated", ()))
+    return [] if old is None else [part for part in missing if part not in old.meta.get("uncalibrated", ())]
+
+
+def recorded_command(words: Sequence[str]) -> str:
+    """A command line as a calibration keeps it: files by their names alone, addresses without who logs in."""
+    return "scanmap " + shlex.join(_without_folders(word) for word in words)
+
+
+def _without_folders(word: str) -> str:
+    if word.startswith("-") or "=" in word.partition("/")[0]:
+        name, sign, value = word.partition("=")
+        return f"{name}{sign}{_without_folders(value)}" if sign else word
+    if "://" in word:
+        scheme, _, rest = word.partition("://")
+        return f"{scheme}://{rest.partition('/')[0].rpartition('@')[2]}"
+    return PurePath(word).name or word
 
 
 def _kept(path: Path) -> Path:

@@ -110,6 +110,10 @@ def _run(words: list[str], debug: bool) -> int:
 
 def _usage(error: Exception) -> str:
     """What is wrong with the command line itself, and what would be right; empty for any other error."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        commands = ", ".join(getattr(error.ctx.command, "commands", ()))  # type: ignore[attr-defined]
+        path = error.ctx.command_path  # type: ignore[attr-defined]
+        return f"{path} does nothing by itself; commands: {commands}; try {path} --help"
     say_it = getattr(error, "format_message", None)
     if say_it is None:
         return ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -174,17 +173,21 @@ def _base(calibration: str | None, out: Path, before: str) -> Calibration:
 
     path = Path(calibration) if calibration is not None else out
     if not path.is_file():
-        raise ConfigError(f"{path}: no such calibration to go on from; {before} --out {path} comes first")
+        raise ConfigError(
+            f"{path}: no such calibration to go on from; {before} --out {path} comes first, "
+            "or give one with --calibration"
+        )
     return Calibration.load(path)
 
 
 def _job(part: str, source: str, board: str, config: str | None, set_: list[str] | None, stop: Stop) -> BoardJob:
     from scanmap import config as configuration
+    from scanmap.calibration.keeping import recorded_command
     from scanmap.session.calibrating import BoardJob
     from scanmap.solvers.board import parse_board
 
     asked = stop.orderly("stopping: the calibration is made of the views so far")
-    command = "scanmap " + shlex.join(word for word in sys.argv[1:])
+    command = recorded_command(sys.argv[1:])
     job = BoardJob(source, parse_board(board), configuration.load(config, set_ or ()), command=command)
     return replace(job, report=_reporter(part, asked, live=job.is_live))
 
@@ -224,7 +227,7 @@ def _run(
     solve: Callable[[BoardJob, Callable[[str], None]], Solved],
 ) -> None:
     """Collect, solve, say, write, draw."""
-    from scanmap.calibration.keeping import refuse_path
+    from scanmap.calibration.keeping import parts_lost, refuse_path
     from scanmap.cli.terminal import say, stop_on_signal
     from scanmap.errors import ConfigError
     from scanmap.session import board_report
@@ -240,8 +243,11 @@ def _run(
     unsaid = solved.views.rejected[SHOWN_REJECTED:]
     if unsaid:
         say(f"not used: {len(unsaid)} more pictures")
+    lost = parts_lost(solved.calibration, out)
     kept = session.write_calibration(solved.calibration, out, f"{part}_rms_px")
     say_written(out, kept)
+    if lost and kept is not None:
+        say(f"note: {kept} had the {' and the '.join(lost)} too; --calibration {kept} would have kept its head")
     for path in board_report.draw(part, solved, figures, rrd):
         say(f"wrote {path}")
     following = {"camera": "laser", "laser": "axis"}.get(part)

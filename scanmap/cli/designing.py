@@ -167,7 +167,7 @@ def _print_ranges(designs: list[Design], sigma_px: float) -> None:
     from scanmap.cli.terminal import console
 
     table = Table(
-        title=f"range step of one column, and sigma at {sigma_px:g} px [mm]", title_justify="left", padding=(0, 0),
+        title=f"range step of one column, and sigma at {sigma_px:g} px (mm)", title_justify="left", padding=(0, 0),
         pad_edge=False,
     )  # fmt: skip
     table.add_column("range m", justify="right")

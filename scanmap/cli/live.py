@@ -47,7 +47,7 @@ def live(
 
     from scanmap import session
     from scanmap.cli.keys import pressed_keys
-    from scanmap.cli.terminal import say, stop_on_signal
+    from scanmap.cli.terminal import output, say, stop_on_signal
 
     with ExitStack() as opened:
         opened.enter_context(stop_on_signal())
@@ -72,6 +72,8 @@ def live(
             print_readings(reading, turned)
             if frames is not None and number >= frames:
                 break
+            if show is None and output.silent:
+                break  # nobody listens any more, nobody looks
 
 
 def words(reading: Reading, knobs: Knobs) -> list[str]:

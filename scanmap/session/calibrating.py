@@ -14,7 +14,7 @@ import numpy as np
 from scanmap.calibration import Calibration, check_residuals
 from scanmap.calibration.file import R_HEAD_CAMERA_FORWARD
 from scanmap.calibration.gates import GATES
-from scanmap.calibration.keeping import save_beside
+from scanmap.calibration.keeping import existing, save_beside
 from scanmap.config import Config
 from scanmap.errors import CalibrationError, CameraError, ConfigError
 from scanmap.geometry import rigid
@@ -167,7 +167,7 @@ def write_calibration(made: Calibration, out: Path, key: str) -> Path | None:
         CalibrationError: the old one is clearly better.
     """
     check_residuals_of_new(made, key)
-    old = _old(out)
+    old = existing(out)
     if old is not None and key in old.residuals:
         before, now = float(old.residuals[key]), float(made.residuals[key])
         if now > WORSE_TIMES * before + WORSE_PX:
@@ -181,13 +181,6 @@ def write_calibration(made: Calibration, out: Path, key: str) -> Path | None:
 def check_residuals_of_new(made: Calibration, key: str) -> None:
     """Raise CalibrationError where the part just solved is over its gate."""
     check_residuals(replace(made, residuals={key: made.residuals[key]}, meta={}))
-
-
-def _old(out: Path) -> Calibration | None:
-    try:
-        return Calibration.load(out) if out.is_file() else None
-    except CalibrationError:
-        return None  # damaged: it is kept beside all the same
 
 
 class _Kept:

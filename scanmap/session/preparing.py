@@ -91,7 +91,7 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool, resume: Path |
         shots=sweeping.shots,
         total=len(swept.bearings),
         comments=_comments(is_twin=is_twin),
-        announcement=[rig_words(config, opened.rig), swept.words],
+        announcement=[rig_words(config, opened.rig), swept.words, *_missing(head)],
         earlier=earlier.source.shots if earlier is not None else None,
         refinement=sweeping.refinement,
         truth=opened.truth,
@@ -148,7 +148,7 @@ def prepare_replay(
         shots=source.shots,
         total=source.count,
         comments=_comments(is_twin=source.is_twin),
-        announcement=[_announcement(source)],
+        announcement=[_announcement(source), *_missing(head)],
         recorded=True,
         source_faults=source.faults,
     )
@@ -209,6 +209,12 @@ def rig_words(config: Config, rig: Rig) -> str:
         return f"DIGITAL TWIN: no hardware is used, the room is made up ({config.twin.room})"
     laser = "" if rig.stage.laser_switchable else "; its laser cannot be switched: it shines until you turn it off"
     return f"rig: {rig.name}, pictures of {rig.camera.width}x{rig.camera.height}{laser}"
+
+
+def _missing(head: Calibration) -> list[str]:
+    if "axis" not in head.meta.get("uncalibrated", ()):
+        return []
+    return ["note: the calibration's axis is not calibrated, the head is taken to stand on it; scanmap calibrate axis"]
 
 
 def _announcement(source: Source) -> str:

@@ -87,8 +87,7 @@ def calibrate_axis(views: Sequence[View], board: Board, calibration: Calibration
         if len(rejected) > ODD_SHARE * len(views):
             raise CalibrationError(
                 f"{len(rejected)} of {len(views)} views contradict the others: the board must stand still while "
-                "the head "
-                "turns, and the bearings must be those of the pictures"
+                "the head turns, and the bearings must be those of the pictures"
             )
         _require(good)
     fit = AxisFit(
@@ -124,9 +123,8 @@ def _require(views: Sequence[View]) -> None:
     span = _span_deg(views)
     if span < SPAN_LEAST_DEG:
         raise CalibrationError(
-            f"the board is in sight over {span:.1f} deg of bearing; at least {SPAN_LEAST_DEG:g} are needed: put "
-            "it farther "
-            "away, and sweep from one edge of the picture to the other"
+            f"the board is in sight over {span:.1f} deg of bearing; at least {SPAN_LEAST_DEG:g} are needed: put it "
+            "farther away, and sweep from one edge of the picture to the other"
         )
 
 
@@ -289,15 +287,13 @@ def _checked(fit: AxisFit, calibration: Calibration) -> AxisFit:
     if fit.rms_px > limit:
         raise CalibrationError(
             f"corners miss the turn about one axis by {fit.rms_px:.2f} px rms, over the gate of {limit:.2f}: "
-            "does the head "
-            "wobble, did the board move, are the bearings right?"
+            "does the head wobble, did the board move, are the bearings right?"
         )
     sigma = np.sqrt(np.diag(fit.own))
     offset, tilt = float(sigma[:2].max()), float(np.degrees(sigma[2:].max()))
     if offset > OFFSET_SIGMA_MOST_M or tilt > TILT_SIGMA_MOST_DEG:
         raise CalibrationError(
             f"the axis is only known to {1e3 * offset:.1f} mm and {tilt:.2f} deg ({1e3 * OFFSET_SIGMA_MOST_M:g} mm and "
-            f"{TILT_SIGMA_MOST_DEG:g} deg needed): more bearings over a wider turn, with the board larger in the "
-            "picture"
+            f"{TILT_SIGMA_MOST_DEG:g} deg needed): more bearings, a wider turn, a board larger in the picture"
         )
     return fit

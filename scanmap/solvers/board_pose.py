@@ -1,4 +1,4 @@
-"""Where a board stands in front of a known camera."""
+"""Where a board stands in front of a known camera, and the head's frame before its laser plane."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.calibration import Intrinsics
+from scanmap.errors import CalibrationError
+from scanmap.geometry import rigid
 from scanmap.solvers.board import Board
 from scanmap.solvers.detection import View
 
@@ -64,3 +66,26 @@ def rough_camera(size: tuple[int, int]) -> Intrinsics:
     width, height = size
     f = width / (2.0 * np.tan(np.radians(30.0)))
     return Intrinsics(width, height, float(f), float(f), (width - 1) / 2, (height - 1) / 2)
+
+
+def head_frame_of(plane: Array) -> Array:
+    """T_head_camera (4, 4) of the head frame that a laser plane (4,) in the camera frame defines.
+
+    The laser plane is y = 0, z is the camera's up within it, x points away from the camera's back, and the origin is
+    the foot of the camera's centre on the plane. For the thesis's head that is (0, baseline, 0) and a yaw of -beta.
+    Where along the plane the laser sits, and where in it the beam points, no board can tell.
+    """
+    normal = plane[:3] / np.linalg.norm(plane[:3])
+    # y is left, the camera's -x.
+    y = -np.sign(normal[0] or 1.0) * normal
+    up = np.array([0.0, -1.0, 0.0])
+    z = up - (up @ y) * y
+    if np.linalg.norm(z) < 0.1:
+        raise CalibrationError(
+            "the laser plane lies along the picture's rows: turn the camera or the laser by 90 deg, one column is "
+            "measured per row"
+        )
+    z /= np.linalg.norm(z)
+    R = np.stack([np.cross(y, z), y, z])
+    distance = plane[3] / np.linalg.norm(plane[:3]) * float(np.sign(y @ normal))
+    return rigid(R, [0.0, distance, 0.0])

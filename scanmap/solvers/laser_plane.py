@@ -14,9 +14,10 @@ from scanmap.calibration import Calibration, Intrinsics, Uncertainty, moved, unc
 from scanmap.calibration.gates import GATES
 from scanmap.calibration.uncertainty import INTRINSICS, PLANE
 from scanmap.errors import CalibrationError
-from scanmap.geometry import fit_plane, inverse, rigid
+from scanmap.geometry import fit_plane, inverse
 from scanmap.solvers.board import Board
 from scanmap.solvers.board_line import BoardLine, points_on_board
+from scanmap.solvers.board_pose import head_frame_of
 from scanmap.solvers.detection import Rejected
 
 Array = NDArray[np.float64]
@@ -91,8 +92,7 @@ def fit_laser_plane(lines: Sequence[BoardLine], board: Board, intrinsics: Intrin
         if len(rejected) > ODD_SHARE * len(lines):
             raise CalibrationError(
                 f"the lines on {len(rejected)} of {len(lines)} boards lie on no common plane: is the laser one "
-                "straight "
-                "line, fixed to the camera, and is the camera's calibration of this camera?"
+                "straight line, fixed to the camera, and is the camera's calibration of this camera?"
             )
     _require_lines(len(good), f" after {len(rejected)} that contradict the others")
     chosen = [clouds[k] for k in good]
@@ -130,29 +130,6 @@ def with_laser_plane(calibration: Calibration, fit: LaserFit, *, keep_head: bool
     return replace(calibration, T_head_camera=T, laser_plane=plane, mount=mount, covariance=joined.table())
 
 
-def head_frame_of(plane: Array) -> Array:
-    """T_head_camera (4, 4) of the head frame that a laser plane (4,) in the camera frame defines.
-
-    The laser plane is y = 0, z is the camera's up within it, x points away from the camera's back, and the origin is
-    the foot of the camera's centre on the plane. For the thesis's head that is (0, baseline, 0) and a yaw of -beta.
-    Where along the plane the laser sits, and where in it the beam points, no board can tell.
-    """
-    normal = plane[:3] / np.linalg.norm(plane[:3])
-    # y is left, the camera's -x.
-    y = -np.sign(normal[0] or 1.0) * normal
-    up = np.array([0.0, -1.0, 0.0])
-    z = up - (up @ y) * y
-    if np.linalg.norm(z) < 0.1:
-        raise CalibrationError(
-            "the laser plane lies along the picture's rows: turn the camera or the laser by 90 deg, one column is "
-            "measured per row"
-        )
-    z /= np.linalg.norm(z)
-    R = np.stack([np.cross(y, z), y, z])
-    distance = plane[3] / np.linalg.norm(plane[:3]) * float(np.sign(y @ normal))
-    return rigid(R, [0.0, distance, 0.0])
-
-
 def residual_of(plane: Array, lines: Sequence[BoardLine], board: Board, intrinsics: Intrinsics) -> tuple[float, float]:
     """How far the lines lie from a given plane (4,) of the camera frame: rms [m], rms [image columns].
 
@@ -175,8 +152,7 @@ def _require_lines(count: int, after: str) -> None:
     if count < LINES_LEAST:
         raise CalibrationError(
             f"the laser line is usable on {count} boards{after}; at least {LINES_LEAST} are needed, 15 are good: "
-            "hold the "
-            "board near and far and turned both ways, with the line across its squares"
+            "hold the board near and far and turned both ways, with the line across its squares"
         )
 
 
@@ -200,17 +176,14 @@ def _per_column(plane: Array, per_px: Array) -> Array:
 
 def _consensus(clouds: Sequence[tuple[Array, Array]], width: int) -> Array:
     """The plane through two of the lines that most of the lines lie on."""
-    few = [cloud[0][:: max(1, len(cloud[0]) // 12)] for cloud in clouds]
+    few = [(p[:: max(1, len(p) // 12)], d[:: max(1, len(p) // 12)]) for p, d in clouds]
     chosen = np.unique(np.linspace(0, len(few) - 1, _TURNS).astype(int))
     bound = ODD_PX * max(1.0, width / 1600.0)
     best, score = np.zeros(4), -1.0
     for i, j in combinations(chosen, 2):
-        found = fit_plane(np.concatenate([few[i], few[j]]))
+        found = fit_plane(np.concatenate([few[i][0], few[j][0]]))
         plane = np.append(found.normal, found.d)
-        off = [
-            np.median(np.abs(_off_px(plane, (p, d[:: max(1, len(d) // 12)]))))
-            for p, (_, d) in zip(few, clouds, strict=True)
-        ]
+        off = [np.median(np.abs(_off_px(plane, cloud))) for cloud in few]
         # Full marks on the plane, none beyond the bound.
         value = float(np.clip(1.0 - np.array(off) / bound, 0.0, None).sum())
         if value > score:
@@ -295,8 +268,7 @@ def _checked(fit: LaserFit, intrinsics: Intrinsics) -> LaserFit:
     if far < DEPTH_RATIO_LEAST * near:
         raise CalibrationError(
             f"all boards are at one distance ({near:.2f} to {far:.2f} m), which leaves the laser plane's "
-            "direction open: "
-            "hold the board near and far"
+            "direction open: hold the board near and far"
         )
     limit = GATES["laser_rms_px"].limit_at(intrinsics.width)
     if fit.rms_px > limit:
@@ -311,7 +283,6 @@ def _checked(fit: LaserFit, intrinsics: Intrinsics) -> LaserFit:
     if angle > ANGLE_SIGMA_MOST_DEG or offset > OFFSET_SIGMA_MOST_M:
         raise CalibrationError(
             f"the laser plane is only known to {angle:.2f} deg and {1e3 * offset:.2f} mm ({ANGLE_SIGMA_MOST_DEG} "
-            "deg and "
-            f"{1e3 * OFFSET_SIGMA_MOST_M:g} mm needed): more boards, nearer and farther, turned both ways"
+            f"deg and {1e3 * OFFSET_SIGMA_MOST_M:g} mm needed): more boards, nearer and farther, turned both ways"
         )
     return fit

@@ -6,6 +6,7 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +59,7 @@ def read_pairs(path: Path) -> Pairs:
     distance = _find(header, DISTANCE_NAMES, units=True)
     if distance is None:
         raise ConfigError(
-            f"{path}, line {lines[0][0]}: no column of distances in the header {', '.join(header)}; "
+            f"{path}, line {lines[0][0]}: no column of distances in the header {shorten(', '.join(header), 120)}; "
             f"valid: {', '.join(DISTANCE_NAMES)}, with _m, _cm or _mm behind"
         )
     found = {
