@@ -11,6 +11,8 @@ import pytest
 from scanmap.calibration import Calibration
 from scanmap.calibration.keeping import parts_lost, recorded_command
 from scanmap.cli import main
+from scanmap.solvers.board import parse_board
+from scanmap.solvers.pictures import Picture, collect
 
 HEAD = "[image]\nwidth = 640\nheight = 480\n[head]\nbaseline_m = 0.08\nbeta_deg = 25.7\nalpha_deg = 32.3\n"
 
@@ -78,3 +80,16 @@ def test_a_missing_calibration_is_said_without_numbers_of_the_system(
     said = capsys.readouterr().err
     assert end.value.code == 1
     assert "no.toml cannot be read: No such file or directory\n" in said
+
+
+def test_a_speed_of_nothing_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["calibrate", "latency", "--speed-deg-s", "0"])
+    assert end.value.code == 2
+    assert "--speed-deg-s" in capsys.readouterr().err
+
+
+def test_a_giant_picture_is_not_searched_for_minutes() -> None:
+    giant = np.broadcast_to(np.uint8(0), (20000, 20000))
+    found = collect([Picture("giant", giant)], parse_board("chessboard:8x6:40mm"))
+    assert "20000x20000 is larger than any" in found.rejected[0].reason

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +49,7 @@ RrdOption = Annotated[
 # Live: so many good views without a wish left are enough.
 LIVE_VIEWS = {"camera": 20, "laser": 15}
 SHOWN_REJECTED = 12
+LINE_EVERY_S = 5.0  # so much silence at most, while pictures of a folder are looked at
 
 
 @calibrate.callback()
@@ -199,10 +201,15 @@ def _reporter(part: str, asked: Callable[[], bool], *, live: bool) -> Callable[[
     from scanmap.solvers.detection import View
 
     said: list[str] = [""]
+    spoken = time.monotonic()
 
     def report(views: Views, last: View | Rejected) -> bool:
+        nonlocal spoken
         if asked():
             return False
+        if not live and time.monotonic() - spoken > LINE_EVERY_S:
+            spoken = time.monotonic()
+            say(f"looked at {len(views.views) + len(views.rejected)} pictures, {len(views.views)} good")
         if isinstance(last, View):
             wanted = guidance(views.views, views.board, views.size) if live and part == "camera" else []
             if live:

@@ -24,7 +24,11 @@ def latency(
     speed_deg_s: Annotated[
         list[float] | None,
         typer.Option(
-            "--speed-deg-s", metavar="SPEED", help="Of the sweeps; two of them tell latency and backlash apart."
+            "--speed-deg-s",
+            min=0.1,
+            max=360.0,
+            metavar="SPEED",
+            help="Of the sweeps; two of them tell latency and backlash apart.",
         ),
     ] = None,
 ) -> None:

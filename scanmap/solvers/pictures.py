@@ -22,6 +22,7 @@ from scanmap.solvers.detection import Rejected, View, find_board, seen_instead
 # Of a video without bearings this many pictures are taken, evenly.
 VIDEO_PICTURES = 120
 # [share] by which markers may measure larger or smaller against their squares than they should.
+PIXELS_MOST = 100_000_000  # looking for a board in more takes minutes
 RATIO_MOST = 0.08
 
 
@@ -143,6 +144,8 @@ def _judged(
     picture: Picture, views: Views, use: Callable[[Picture, View], Rejected | None], distinct: bool
 ) -> View | Rejected:
     height, width = picture.image.shape[:2]
+    if height * width > PIXELS_MOST:
+        return Rejected(picture.name, f"{width}x{height} is larger than any camera's picture; at most 100 megapixels")
     if views.size == (0, 0):
         views.size = (width, height)
     if views.size != (width, height):
