@@ -133,6 +133,12 @@ def test_a_stalled_motor_is_not_homed_for_ever() -> None:
     assert len(shots) == 5 and len(notes) == 2 and "motor stalled" in ended
 
 
+def test_a_motor_that_stalls_where_the_room_is_plain_is_noticed_at_the_end() -> None:
+    """There no picture differs from the next; but from there the head does not come back either."""
+    shots, _, ended, _ = run("sweep.end_deg=80", "sweep.step_deg=8", "sweep.off_frames=true", fault=stall, after=9)
+    assert len(shots) == 11 and "it still shows what it saw last, the motor stalled" in ended
+
+
 def test_steps_lost_too_few_at_a_time_are_noticed_at_the_end() -> None:
     def creep(twin: TwinDevices) -> None:
         follow = twin.firmware.drivetrain.follow

@@ -175,7 +175,10 @@ class Steps:
         first = self._watch.first if self._watch is not None else None
         if self._watch is None or first is None or not self._params.park or len(self._planned.bearings) < 2:
             return
-        wrong = self._watch.displaced(first, self.shoot(first.index, first.bearing_commanded))
+        again = self.shoot(first.index, first.bearing_commanded)
+        wrong = self._watch.displaced(first, again)
+        if not self._watch.came_back(again):
+            wrong = "told to go back to where it began, it still shows what it saw last, the motor stalled"
         if wrong:
             raise StageError(
                 f"the head has lost its place in the course of the scan: {wrong}; its bearings cannot be trusted: "

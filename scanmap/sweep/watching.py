@@ -97,6 +97,16 @@ class Watch:
             f"about {degrees(shift.columns_px / self.px_per_rad):.2f} deg"
         )
 
+    def came_back(self, again: Shot) -> bool:
+        """Whether the head, shot again at its first bearing, has left its last: False only where that is proved.
+
+        The line is not asked: where it is faint, noise is the brightest thing.
+        """
+        if self.first is None or self.last is None or self.first is self.last:
+            return True
+        begun, left = self.shift(self.first, again), self.shift(self.last, again)
+        return left is None or not left.is_small or (begun is not None and begun.is_small)
+
     def stands(self, shot: Shot, elsewhere: Shot) -> bool:
         """Whether two shots that are said to be far apart show the same: room and line in the same place."""
         shift = self.shift(shot, elsewhere)
