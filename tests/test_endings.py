@@ -30,9 +30,9 @@ import cv2
 import numpy as np
 from fake_cameras import FakeCapture, FakeDevice, noisy
 from scanmap.cli import main
-from scanmap.rig import camera_stream, grbl
+from scanmap.rig import camera_stream, grbl_opening
 port, ending = sys.argv[1:]
-grbl.BOOT_S = camera_stream.WARM_UP_S = camera_stream.AUTOMATIC_WARM_UP_S = camera_stream.FOLLOW_S = 0.1
+grbl_opening.BOOT_S = camera_stream.WARM_UP_S = camera_stream.AUTOMATIC_WARM_UP_S = camera_stream.FOLLOW_S = 0.1
 device = FakeDevice(sizes=((160, 120),), period_s=0.02)
 
 def picture(size):

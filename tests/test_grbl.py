@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanmap.errors import StageError
-from scanmap.rig import Frame, Rig, Stage
-from scanmap.rig import grbl as grbl_module
+from scanmap.rig import Frame, Rig, Stage, grbl_opening
 from scanmap.rig import grbl_protocol as protocol
-from scanmap.rig.grbl import GrblStage, open_grbl
+from scanmap.rig.grbl import GrblStage
+from scanmap.rig.grbl_opening import open_grbl
 from scanmap.rig.serial_port import SerialPort
 from scanmap.rig.stage import StageParams, open_stage
 from scanmap.sweep import SweepParams, sweep
@@ -55,8 +55,8 @@ def board(request: pytest.FixtureRequest) -> Firmware:
 
 @pytest.fixture(params=sorted(PORTS))
 def url(request: pytest.FixtureRequest, board: Firmware, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(grbl_module, "BOOT_S", 0.1)  # a pty never restarts its board
-    monkeypatch.setattr(grbl_module, "GREETING_S", 0.1)
+    monkeypatch.setattr(grbl_opening, "BOOT_S", 0.1)  # a pty never restarts its board
+    monkeypatch.setattr(grbl_opening, "GREETING_S", 0.1)
     before = handles(), threading.active_count()
     with PORTS[request.param](board) as url:
         yield url
@@ -319,10 +319,10 @@ def test_a_restart_while_homing_ends_in_bounded_time(monkeypatch: pytest.MonkeyP
 
 def test_auto_names_what_it_tried(monkeypatch: pytest.MonkeyPatch, uno: Uno) -> None:
     board, url = uno
-    monkeypatch.setattr(grbl_module, "serial_devices", lambda: [])
+    monkeypatch.setattr(grbl_opening, "serial_devices", lambda: [])
     with pytest.raises(StageError, match="no serial port on this machine"):
         open_grbl(StageParams())
-    monkeypatch.setattr(grbl_module, "serial_devices", lambda: ["/dev/nothing", "loop://", url])
+    monkeypatch.setattr(grbl_opening, "serial_devices", lambda: ["/dev/nothing", "loop://", url])
     stage = open_grbl(StageParams(timeout_s=0.05))
     assert stage.name == f"grbl on {url}"
     stage.close()
@@ -373,7 +373,7 @@ def test_noise_on_the_line_before_the_banner_does_no_harm(noise: bytes) -> None:
 
 KILLED = """
 import os, signal, sys
-from scanmap.rig import grbl
+from scanmap.rig import grbl_opening as grbl
 from scanmap.rig.stage import StageParams
 grbl.BOOT_S = 0.2
 stage = grbl.open_grbl(StageParams(port=sys.argv[1]))

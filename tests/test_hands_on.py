@@ -181,7 +181,7 @@ import sys
 import cv2
 from fake_cameras import FakeCapture, FakeDevice
 from scanmap.cli import main
-from scanmap.rig import grbl
+from scanmap.rig import grbl_opening as grbl
 device = FakeDevice(sizes=((320, 240),))
 cv2.VideoCapture = lambda *_: FakeCapture(device)
 grbl.BOOT_S = 0.1

@@ -17,7 +17,7 @@ from scanmap import config as configuration
 from scanmap import session
 from scanmap.errors import CalibrationError, CameraError, ConfigError, StageError
 from scanmap.recording import open_source
-from scanmap.rig import grbl as grbl_module
+from scanmap.rig import grbl_opening
 from scanmap.session.rigs import open_rig
 from scanmap.shot import decode_image
 from scanmap.sweep import SweepParams, plan, sweep
@@ -57,7 +57,7 @@ def head(monkeypatch: pytest.MonkeyPatch) -> Head:
     real = cv2.VideoCapture
     fake = lambda target, *rest: FakeCapture(head.device) if target == 0 else real(target, *rest)  # noqa: E731
     monkeypatch.setattr(cv2, "VideoCapture", fake)
-    monkeypatch.setattr(grbl_module, "BOOT_S", 0.1)
+    monkeypatch.setattr(grbl_opening, "BOOT_S", 0.1)
     for name in ("WARM_UP_S", "AUTOMATIC_WARM_UP_S", "FOLLOW_S"):
         monkeypatch.setattr(f"scanmap.rig.camera_stream.{name}", 0.0)
     return head

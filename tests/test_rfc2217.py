@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from scanmap.errors import StageError
-from scanmap.rig.grbl import open_grbl
+from scanmap.rig.grbl_opening import open_grbl
 from scanmap.rig.stage import StageParams
 from scanmap.twin.firmware import Firmware
 

@@ -14,7 +14,6 @@ from scanmap.laserline.path import strips
 from scanmap.laserline.sight import Sight
 
 F32 = NDArray[np.float32]
-I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
 

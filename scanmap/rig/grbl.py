@@ -6,7 +6,6 @@ number of motor steps, not what was asked for.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 
@@ -15,14 +14,9 @@ from scanmap.rig import grbl_protocol as protocol
 from scanmap.rig.grbl_link import GrblLink
 from scanmap.rig.grbl_protocol import Dialect, Status
 from scanmap.rig.grbl_settings import fit_settings, idle_setting_afterwards
-from scanmap.rig.serial_port import open_serial, serial_devices
 from scanmap.rig.stage import StageParams, check_limits
 from scanmap.rig.watchdog import Watchdog
 
-__all__ = ["GrblStage", "StageParams", "identify", "open_grbl"]
-
-BOOT_S = 2.5  # an Uno restarts when its port opens; its boot loader takes 1.6 s
-GREETING_S = 0.3  # a board behind a network says its banner at once, if at all
 HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
 REPORT_DEG = 0.001  # resolution of a status report
 REPORT_INCH_DEG = 25.4e-4  # the same for a board that reports in inches ($13=1)
@@ -36,7 +30,7 @@ class GrblStage:
     """A head on a GRBL board. Implements `scanmap.rig.Stage`; not thread-safe."""
 
     def __init__(self, link: GrblLink, dialect: Dialect, params: StageParams) -> None:
-        """Take over a board that has just answered with its banner; `open_grbl` makes one.
+        """Take over a board that has just answered with its banner; `grbl_opening.open_grbl` makes one.
 
         Raises:
             StageError: the board is in an alarm that cannot be cleared, or its settings cannot be made to fit.
@@ -301,58 +295,3 @@ class GrblStage:
         if self._params.steps_per_deg:
             return count / self._params.steps_per_deg
         return count / told if abs(count / told - x) <= self._report_deg else x
-
-
-def open_grbl(params: StageParams) -> GrblStage:
-    """Open the board on `params.port`; `auto` takes the first port where one answers.
-
-    Raises:
-        StageError: no port, or none where a GRBL board answers.
-    """
-    if params.port != "auto":
-        return _open_port(params.port, params)
-    faults = []
-    for device in serial_devices():
-        try:
-            return _open_port(device, params)
-        except StageError as error:
-            faults.append(f"{device}: {error}")
-    raise StageError(
-        "no GRBL board found ("
-        + ("; ".join(faults) or "no serial port on this machine")
-        + "): plug it in, or set stage.port; `scanmap doctor` lists what answers"
-    )
-
-
-def identify(url: str, params: StageParams) -> str:
-    """Firmware and version of the board on a port; changes no setting, though opening may reset the board.
-
-    Raises:
-        StageError: the port cannot be opened, or nothing there answers like a GRBL board.
-    """
-    link = GrblLink(open_serial(url, params.baud), params.timeout_s)
-    try:
-        banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
-        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
-        return f"{dialect.value} {banner.version}"
-    finally:
-        link.close()
-
-
-def _open_port(url: str, params: StageParams) -> GrblStage:
-    port = open_serial(url, params.baud)
-    link = GrblLink(port, params.timeout_s)
-    try:
-        banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
-        if banner.dialect is Dialect.GRBL and banner.version.startswith("0."):
-            raise StageError(f"{url} runs grbl {banner.version}: flash grbl 1.1 or newer")
-        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
-        stage = GrblStage(link, dialect, params)
-        if params.watchdog and stage.laser_switchable and not url.startswith("twin://"):
-            stage.watch_over(Watchdog(url, params.baud))
-        return stage
-    except BaseException:
-        with contextlib.suppress(StageError):
-            link.send_reset()  # it may be homing
-        link.close()
-        raise

@@ -17,7 +17,6 @@ STATUS = b"?"
 HOLD = b"!"
 RESUME = b"~"
 RESET = b"\x18"
-JOG_CANCEL = b"\x85"
 
 RX_BUFFER_BYTES = 127  # what may be sent and not yet answered; real ones hold 128 or more
 

@@ -98,7 +98,7 @@ def open_stage(params: StageParams, ask: Callable[[str], str] = input) -> Stage:
         from scanmap.rig.template import open_template
 
         return open_template(params)
-    from scanmap.rig.grbl import open_grbl
+    from scanmap.rig.grbl_opening import open_grbl
 
     return open_grbl(params)
 

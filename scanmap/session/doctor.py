@@ -15,7 +15,7 @@ from scanmap.pipeline import Pipeline
 from scanmap.rig import Frame, Streaming
 from scanmap.rig.camera import camera_devices
 from scanmap.rig.camera_probe import probe_modes
-from scanmap.rig.grbl import identify
+from scanmap.rig.grbl_opening import identify
 from scanmap.rig.serial_port import serial_devices
 from scanmap.session.latency import laser_contrast, latency_by_blinks
 from scanmap.session.preparing import Choice, rig_words

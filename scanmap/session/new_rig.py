@@ -12,7 +12,7 @@ from scanmap.config import Config, parse
 from scanmap.errors import CameraError, ConfigError, StageError
 from scanmap.rig.camera import CameraParams, camera_devices, open_camera
 from scanmap.rig.camera_probe import Mode, probe_modes
-from scanmap.rig.grbl import identify
+from scanmap.rig.grbl_opening import identify
 from scanmap.rig.serial_port import serial_devices
 from scanmap.rig.stage import StageParams
 

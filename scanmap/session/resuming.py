@@ -19,12 +19,7 @@ from scanmap.sweep import Homable, Plan, Settable, Steps, Watch, plan
 CHANGEABLE = ("stage", "camera", "recording", "view")  # sections that may differ: another port, another disk
 SAME_PLACE_RAD = math.radians(0.01)
 CORRECTIONS = 3  # of the head's place by the picture
-AGREE_RAD = math.radians(3.0)
-SAME_PLACE_RAD = math.radians(0.01)
-CORRECTIONS = 3  # of the head's place by the picture
 AGREE_RAD = math.radians(1.0)  # answers of different pictures that mean one place: nearness of things shifts them
-RECOGNISED = 35.0  # standard deviations, of all pictures that agree; chance likenesses reach 30
-RIVAL = 1.5  # times the support of the next best place
 LANDMARKS = 60  # recorded pictures that the head's present view is searched in
 
 

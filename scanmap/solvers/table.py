@@ -143,11 +143,6 @@ def fit_pinhole(column: Array, distance: Array, start: RatioModel, *, free_basel
     return model(_solve(lambda x: model(x).depth(column) / distance - 1.0, first))
 
 
-def relative_errors(depth: Array, distance: Array) -> Array:
-    """Errors (N,) of depths against measured distances, relative."""
-    return depth / distance - 1.0
-
-
 def calibration_of(fit: TableFit, height: int, base: Calibration | None = None) -> Calibration:
     """The fit as a calibration; on top of `base`, if there is one, only `[ratio]` and `[pixel_angle]` are new.
 
