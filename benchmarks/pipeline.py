@@ -21,7 +21,7 @@ import numpy as np
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import find_laser_line
-from scanmap.pipeline import Pipeline, Processes, run
+from scanmap.pipeline import Pipeline, Processes
 from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
 from scanmap.session.job import finished_scan
@@ -30,6 +30,7 @@ from scanmap.triangulation import triangulate
 
 WIDTH, HEIGHT = 1600, 1200
 DISTINCT = 24
+QUALITY, QUALITY_GREY = 89, 88  # of 285 kB a frame
 
 
 def frames(red_filter: bool = False) -> list[bytes]:
@@ -37,6 +38,7 @@ def frames(red_filter: bool = False) -> list[bytes]:
     rng = np.random.default_rng(1)
     rows, columns = np.arange(HEIGHT)[:, None], np.arange(WIDTH)[None, :]
     texture = cv2.GaussianBlur(rng.normal(0, 60, (HEIGHT, WIDTH, 3)).astype(np.float32), (0, 0), 3)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY_GREY if red_filter else QUALITY]
     made = []
     for k in range(DISTINCT):
         centre = 230 + 20 * np.sin(rows / 190 + k) + k
@@ -44,7 +46,7 @@ def frames(red_filter: bool = False) -> list[bytes]:
         image = 25 + texture + rng.normal(0, 3, (HEIGHT, WIDTH, 3))
         image += line[..., None] * np.array([0.1, 0.15, 1.0])
         pixels = np.clip(image[..., 2] if red_filter else image, 0, 255).astype(np.uint8)
-        made.append(bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]))
+        made.append(bytes(cv2.imencode(".jpg", pixels, quality)[1]))
     return made
 
 
@@ -106,7 +108,7 @@ def main() -> None:
         scan = Scan(head.mount, HEIGHT)
         with Processes(pipeline) as workers:  # their start counts
             sinks = [lambda step: scan.add(step.profile, step.shot.bearing)]
-            run(open_source(path).shots(), workers.process, sinks, workers=workers.threads)
+            workers.run(open_source(path).shots(), sinks)
             worker_mb = [peak_mb(pid) for pid in workers.pids]
         replay_s = time.perf_counter() - start
         start = time.perf_counter()

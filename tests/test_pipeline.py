@@ -5,6 +5,8 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
+from typing import cast
 
 import cv2
 import numpy as np
@@ -157,12 +159,16 @@ def processes(pipeline: Pipeline) -> Iterator[Processes]:
 def test_worker_processes_do_not_change_a_bit(pipeline: Pipeline, processes: Processes) -> None:
     results = []
     source = [*shots(9, jpeg=True), Shot(9, 0.0, 0.0, 0.0, b"\xff\xd8\xff nothing")]
-    for process, threads in ((pipeline.process, 1), (processes.process, processes.threads)):
+    for runner in (
+        partial(run, process=pipeline.process, workers=1),
+        partial(run, process=processes.process, workers=processes.threads),
+        processes.run,
+    ):
         steps: list[Step] = []
-        run(source, process, [steps.append], workers=threads)
+        assert runner(source, sinks=[steps.append], stop=lambda: False) == len(source)
         assert [step.shot for step in steps] == source
         results.append([(*(a.tobytes() for a in (*step.line, *step.profile)), step.fault) for step in steps])
-    assert results[0] == results[1]
+    assert results[0] == results[1] == results[2]
     assert "decoded" in results[1][-1][-1]
 
 
@@ -176,6 +182,29 @@ def test_what_a_worker_process_raises_is_raised_here(head: Calibration) -> None:
     assert str(there.value) == str(here.value)
 
 
+def test_steps_before_what_a_worker_process_raises_reach_the_sinks(pipeline: Pipeline, processes: Processes) -> None:
+    broken = Shot(4, 0.0, 0.0, 0.0, cast(bytes, None))
+    steps: list[Step] = []
+    with pytest.raises(Exception) as here:
+        pipeline.process(broken)
+    with pytest.raises(type(here.value)):
+        processes.run([*shots(4), broken, *shots(3)], [steps.append])
+    assert [step.shot.index for step in steps][:4] == list(range(4))
+
+
+def test_source_that_fails_and_stop_end_the_worker_processes_run_too(processes: Processes) -> None:
+    def breaking() -> Iterator[Shot]:
+        yield from shots(5)
+        raise StageError("the stage is gone")
+
+    steps: list[Step] = []
+    with pytest.raises(StageError, match="gone"):
+        processes.run(breaking(), [steps.append])
+    assert [step.shot.index for step in steps] == list(range(5))
+    assert processes.run(shots(60), [], stop=lambda: True) == 1
+    assert processes.run(shots(60), [steps.append], stop=lambda: len(steps) >= 8) < 45
+
+
 def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
     steps: list[Step] = []
     with Processes(pipeline, count=2) as workers:
@@ -185,7 +214,7 @@ def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
             if len(steps) == 3:
                 os.kill(workers.pids[0], signal.SIGKILL)
 
-        run(shots(12), workers.process, [sink], workers=workers.threads)
+        workers.run(shots(12), [sink])
     assert [step.shot.index for step in steps] == list(range(12))
     assert all((step.line.reason == Reason.OK).mean() > 0.99 for step in steps)
 

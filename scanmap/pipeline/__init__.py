@@ -1,7 +1,7 @@
 """Shot to Step: the one loop, and its decode workers. Grid, guard and view come in as sinks."""
 
 from scanmap.pipeline.processes import Processes, worth_processes
-from scanmap.pipeline.running import checked, run
+from scanmap.pipeline.running import Runner, checked, run
 from scanmap.pipeline.step import Pipeline, Sink, Step
 
-__all__ = ["Pipeline", "Processes", "Sink", "Step", "checked", "run", "worth_processes"]
+__all__ = ["Pipeline", "Processes", "Runner", "Sink", "Step", "checked", "run", "worth_processes"]

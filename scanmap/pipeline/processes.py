@@ -8,6 +8,7 @@ which would run the user's script once more in each of them, or copy a process i
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import pickle
@@ -15,11 +16,13 @@ import queue
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import IO, NamedTuple, cast
 
 from scanmap.laserline import LaserLine
-from scanmap.pipeline.step import Pipeline, Step
+from scanmap.pipeline.running import run_groups
+from scanmap.pipeline.step import Pipeline, Sink, Step
 from scanmap.shot import Shot
 from scanmap.triangulation import Profile
 
@@ -27,8 +30,13 @@ log = logging.getLogger(__name__)
 
 # Below so many shots a worker costs more to start (half a second) than it brings.
 WORTH_SHOTS = 100
-# Shots on their way to one worker: it finds the next image waiting when it is done with one.
+# Shots sent in one message: waking this process for each interrupted a worker ten times a frame.
+TOGETHER = 3
+# Messages on their way to one worker: it finds the next images waiting when it is done with some.
 IN_FLIGHT = 2
+# What a pipe should hold, where the system lets it: with its usual 64 kB either side waits for the other several times
+# a frame.
+_PIPE_BYTES = 1 << 20
 PATIENCE_S = 5.0
 # glibc gives large arrays back to the system as they are freed, and asking for them anew costs a fifth of a frame's
 # time in page faults; elsewhere these names mean nothing.
@@ -58,8 +66,8 @@ def worth_processes(shots: int | None) -> bool:
 class Processes:
     """Worker processes for one pipeline; a context manager that ends them.
 
-    `process` gives what `Pipeline.process` gives, bit for bit, and may be called from `threads` threads at once.
-    A worker that is killed is missed only in speed: its shots are processed here.
+    `run` and `process` give what `run` with `Pipeline.process` gives, bit for bit; `process` may be called from
+    `threads` threads at once. A worker that is killed is missed only in speed: its shots are processed here.
     """
 
     def __init__(self, pipeline: Pipeline, count: int = 0) -> None:
@@ -86,19 +94,32 @@ class Processes:
         """The workers' process numbers."""
         return [worker.pid for worker in self._workers]
 
+    def run(self, shots: Iterable[Shot], sinks: Iterable[Sink], stop: Callable[[], bool] = lambda: False) -> int:
+        """As `pipeline.run`, on all workers."""
+        return run_groups(shots, self._processed, sinks, stop, self.threads, TOGETHER)
+
     def process(self, shot: Shot) -> Step:
         """`Pipeline.process`, done by whichever worker is free."""
+        return next(self._processed([shot]))
+
+    def _processed(self, shots: list[Shot]) -> Iterator[Step]:
+        """The steps of shots that whichever worker is free has processed; or what it raised, in the place of one."""
         worker = self._free.get()
         try:
-            answer = worker.ask(shot)
+            answers = worker.ask(shots)
         except (OSError, EOFError, pickle.UnpicklingError, ValueError) as gone:
             log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
-            return self.pipeline.process(shot)
+            return iter([self.pipeline.process(shot) for shot in shots])
         finally:
             self._free.put(worker)
+        return _steps(shots, answers)
+
+
+def _steps(shots: list[Shot], answers: list[Answer]) -> Iterator[Step]:
+    for shot, answer in zip(shots, answers, strict=True):
         if answer.line is None or answer.profile is None:
             raise answer.error or RuntimeError("a worker process answered nothing")
-        return Step(shot, answer.line, answer.profile, answer.fault)
+        yield Step(shot, answer.line, answer.profile, answer.fault)
 
 
 class _Worker:
@@ -115,6 +136,8 @@ class _Worker:
         )
         self._to = cast(IO[bytes], self._process.stdin)
         self._back = cast(IO[bytes], self._process.stdout)
+        for pipe in (self._to, self._back):
+            _widen(pipe)
         self._sending = threading.Lock()
         self._last_read = threading.Event()
         self._last_read.set()
@@ -123,20 +146,20 @@ class _Worker:
             pickle.dump(first, self._to, protocol=5)
         self._to.flush()
 
-    def ask(self, shot: Shot) -> Answer:
-        """Send a shot, wait for its answer; answers come in the order of the shots, whichever thread asked."""
+    def ask(self, shots: list[Shot]) -> list[Answer]:
+        """Send shots, wait for the answers, which come in the order of the messages, whichever thread asked."""
         with self._sending:
             before, read = self._last_read, threading.Event()
             self._last_read = read
             try:
-                pickle.dump(shot, self._to, protocol=5)
+                pickle.dump(shots, self._to, protocol=5)
                 self._to.flush()
             except BaseException:
                 read.set()
                 raise
         try:
             before.wait()
-            return cast(Answer, pickle.load(self._back))
+            return cast(list[Answer], pickle.load(self._back))
         finally:
             read.set()
 
@@ -152,21 +175,33 @@ class _Worker:
         self._back.close()
 
 
-def serve(shots: IO[bytes], answers: IO[bytes]) -> None:
-    """The worker's own loop: a Pipeline first, then shots until the pipe closes."""
+def _widen(pipe: IO[bytes]) -> None:
+    """Let a pipe hold more, where the system can and will."""
+    with contextlib.suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+
+def serve(messages: IO[bytes], answers: IO[bytes]) -> None:
+    """The worker's own loop: a Pipeline first, then messages of shots until the pipe closes."""
     import cv2
 
     cv2.setNumThreads(1)  # the workers are the parallelism
-    pipeline = cast(Pipeline, pickle.load(shots))
+    pipeline = cast(Pipeline, pickle.load(messages))
+    gc.freeze()  # what was imported is never garbage
     while True:
         try:
-            shot = cast(Shot, pickle.load(shots))
+            shots = cast(list[Shot], pickle.load(messages))
         except EOFError:
             return
-        try:
-            step = pipeline.process(shot)
-            answer = Answer(step.line, step.profile, step.fault)
-        except Exception as error:
-            answer = Answer(error=error)
-        pickle.dump(answer, answers, protocol=5)
+        pickle.dump([_answer(pipeline, shot) for shot in shots], answers, protocol=5)
         answers.flush()
+
+
+def _answer(pipeline: Pipeline, shot: Shot) -> Answer:
+    try:
+        step = pipeline.process(shot)
+        return Answer(step.line, step.profile, step.fault)
+    except Exception as error:
+        return Answer(error=error)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import chain
+from typing import Protocol
 
 import cv2
 
@@ -17,6 +18,12 @@ from scanmap.pipeline.step import Sink, Step
 from scanmap.shot import Shot, decode_image
 
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
+
+
+class Runner(Protocol):
+    """`run`, on whatever it runs."""
+
+    def __call__(self, shots: Iterable[Shot], *, sinks: Iterable[Sink], stop: Callable[[], bool]) -> int: ...
 
 
 def checked(shots: Iterable[Shot], calibration: Calibration) -> Iterator[Shot]:
@@ -58,34 +65,52 @@ def run(
     Args:
         shots: the source; consumed in the caller's thread, a few shots ahead of the sinks, never more, so
             that memory does not grow with the number of frames.
-        process: `Pipeline.process`, or `Processes.process` where there are many shots.
+        process: `Pipeline.process`; where there are many shots, `Processes.run` is the same on every core.
         sinks: each called with every Step, in the caller's thread.
         stop: asked before each shot; True ends the loop after what was begun.
         workers: threads that call `process`; 0 takes one per processor core.
 
     When the source raises, the steps already begun reach the sinks first.
     """
+    return run_groups(shots, lambda group: [process(shot) for shot in group], sinks, stop, workers, 1)
+
+
+def run_groups(
+    shots: Iterable[Shot],
+    process: Callable[[list[Shot]], Iterable[Step]],
+    sinks: Iterable[Sink],
+    stop: Callable[[], bool],
+    workers: int,
+    together: int,
+) -> int:
+    """`run` with `together` shots handed to a thread at once; what `process` gives is iterated in the caller's."""
     workers = workers or os.cpu_count() or 1
     sinks = tuple(sinks)
-    pending: deque[Future[Step]] = deque()
+    pending: deque[Future[Iterable[Step]]] = deque()
+    group: list[Shot] = []
     done = 0
 
     def deliver() -> None:
         nonlocal done
-        step = pending.popleft().result()
-        for sink in sinks:
-            sink(step)
-        done += 1
+        for step in pending.popleft().result():
+            for sink in sinks:
+                sink(step)
+            done += 1
 
     with _single_threaded_opencv(), ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
         try:
             for shot in shots:
-                pending.append(pool.submit(process, shot))
+                group.append(shot)
+                if len(group) == together:
+                    pending.append(pool.submit(process, group))
+                    group = []
                 while len(pending) > 2 * workers or (pending and pending[0].done()):
                     deliver()
                 if stop():
                     break
         finally:
+            if group:
+                pending.append(pool.submit(process, group))
             while pending:
                 deliver()
     return done

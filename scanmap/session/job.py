@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,7 +18,7 @@ from scanmap.config import Config
 from scanmap.errors import RecordingError, ScanmapError
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import Reason
-from scanmap.pipeline import Pipeline, Processes, Sink, Step, checked, run, worth_processes
+from scanmap.pipeline import Pipeline, Processes, Runner, Sink, Step, checked, run, worth_processes
 from scanmap.recording import Recorder
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
@@ -115,8 +116,8 @@ class Job:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
             sinks = self._sinks(scan, progress)
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
-            with closing(self._recorded()) as shots, self.workers(pipeline) as (process, threads):
-                run(checked(shots, self.calibration), process, sinks, stop, threads)
+            with closing(self._recorded()) as shots, self.runner(pipeline) as run_shots:
+                run_shots(checked(shots, self.calibration), sinks=sinks, stop=stop)
             if stop():
                 ended = "interrupted"
         except KeyboardInterrupt:
@@ -141,16 +142,15 @@ class Job:
             self.recorder.fault(fault, part="sweep", seconds=self._last_s)
 
     @contextmanager
-    def workers(self, pipeline: Pipeline) -> Iterator[tuple[Callable[[Shot], Step], int]]:
-        """What processes a shot, and in how many threads; a live scan waits for its camera, not for a core."""
+    def runner(self, pipeline: Pipeline) -> Iterator[Runner]:
+        """What processes shots on all cores; a live scan waits for its camera, not for a core."""
         if self.refinement is not None:
-            yield self.refinement.collecting(pipeline.process), 0
-            return
-        if not self.recorded or not worth_processes(self.total):
-            yield pipeline.process, 0
-            return
-        with Processes(pipeline) as workers:
-            yield workers.process, workers.threads
+            yield partial(run, process=self.refinement.collecting(pipeline.process))
+        elif not self.recorded or not worth_processes(self.total):
+            yield partial(run, process=pipeline.process)
+        else:
+            with Processes(pipeline) as workers:
+                yield workers.run
 
     def _recorded(self) -> Generator[Shot]:
         """The shots, each in the recording before anything is done with it."""

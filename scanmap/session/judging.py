@@ -13,7 +13,7 @@ import numpy as np
 from scanmap.calibration import Calibration
 from scanmap.calibration.keeping import save_beside
 from scanmap.errors import CalibrationError, RecordingError
-from scanmap.pipeline import Pipeline, Step, checked, run
+from scanmap.pipeline import Pipeline, Step, checked
 from scanmap.session.job import Job, Progress
 from scanmap.shot import Shot
 from scanmap.solvers.self_calibration import Refined
@@ -55,8 +55,8 @@ def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable
         found = int(np.isfinite(step.line.column_px).sum())
         progress(Progress(done, job.total, float(np.degrees(step.shot.bearing)), found, own.height))
 
-    with closing(_closable(job.shots())) as shots, job.workers(pipeline) as (process, threads):
-        run(checked(shots, job.calibration), process, [keep], stop, threads)
+    with closing(_closable(job.shots())) as shots, job.runner(pipeline) as run_shots:
+        run_shots(checked(shots, job.calibration), sinks=[keep], stop=stop)
     if stop():
         raise KeyboardInterrupt
     if not done:
