@@ -17,8 +17,10 @@ _CLEAR_RATIO, _CLEAR = 2.5, 15.0
 # Blue line lasers are rare, and what is blue in a room without any is not: they must stand out twice as much.
 _USUAL = (0.5, 1.0, 1.0)
 _NARROW_PX, _BRIGHT_PX = (5, 160), (16, 40)  # distance of a line's sides: at least, and as a part of the width
-_LEADS, _NEARLY = 2, 230  # [grey levels] that a channel must lead the others by, and from which on it need not
-_BLAZING, _ALONE = 200, 60  # [grey levels] of a channel, and above the other two
+_BLAZING, _ALONE = 240, 100  # [grey levels] of a channel, and above the other two
+# What a place counts at most beside the others of its chain [grey levels], and what a chain pays for going on
+# elsewhere, in such places; columns a row that a line runs at most.
+_ENOUGH, _JUMP, _STEEP = 30, 2, 1.0
 _MANY = 0.3  # share of the rows
 
 
@@ -31,9 +33,11 @@ def judged_channel(image: U8) -> tuple[int, bool]:
     """The laser's channel (0 blue, 1 green, 2 red) in a BGR image, and whether there is no doubt about it.
 
     Measured on some pairs of rows: how far the best place rises above both its sides in the channel and in the
-    channel's lead over the other two, whichever is less, and in both rows; the better half of the pairs counts. So
-    neither white things vote, however bright, nor wide coloured ones, nor specks. Where the core saturates every
-    channel alike, its flanks still have the laser's colour and lend it theirs.
+    channel's lead over each of the other two, whichever is least, and in both rows; the better half of the pairs
+    counts. So neither white things vote, however bright, nor wide coloured ones, nor specks; and green light on red
+    wood, where red remains the brighter, is still green. Where the core saturates every channel alike, its flanks
+    still have the laser's colour and lend it theirs. Where few pairs do not tell, more do, and in the end it counts
+    what goes on from pair to pair: the line does, and cables, spines of books and skin do not.
     """
     for pairs in _COLOUR_PAIRS:
         step = max(1, len(image) // pairs)
@@ -54,11 +58,24 @@ def judged_channel(image: U8) -> tuple[int, bool]:
             # So few must agree, nearly all of them.
             clear &= bool(best[int(np.argmax(strength))][n // 4] > max(_CLEAR_RATIO * second, _CLEAR))
         if clear:
-            break
+            return int(np.argmax(strength)), True
     # A grey picture in three channels has no lead at all: then the brightest line counts.
     if first <= 1.0:
         strength = [float(_ridge(plane, max(9, image.shape[1] // 96)).max(axis=1).mean()) for plane in rows]
-    return int(np.argmax(strength)), clear
+    else:
+        strength = [rare * chain for rare, chain in zip(_USUAL, _chains(both.reshape(3, n, -1), step), strict=True)]
+    return int(np.argmax(strength)), False
+
+
+def _chains(rising: U8, step: int) -> list[float]:
+    """The best sum along a chain of places, one in each of n rows `step` apart, for each channel (3, n, W)."""
+    enough = np.minimum(rising, _ENOUGH).astype(np.float32)
+    reach = np.ones((1, 2 * max(2, int(_STEEP * step)) + 1), np.uint8)
+    total = enough[:, 0].copy()
+    for row in range(1, enough.shape[1]):
+        elsewhere = total.max(axis=1, keepdims=True) - _JUMP * _ENOUGH
+        total = enough[:, row] + np.maximum(cv2.dilate(total, reach), elsewhere)
+    return [float(best) for best in total.max(axis=1)]
 
 
 def _planes(rows: U8) -> list[U8]:
@@ -66,39 +83,39 @@ def _planes(rows: U8) -> list[U8]:
 
 
 def _by_colour(planes: Sequence[U8]) -> U8:
-    """How far each place (n, W) rises in a channel and in its lead over the others; the channels below each other."""
-    others = [np.asarray(cv2.max(planes[c - 1], planes[c - 2]), np.uint8) for c in range(3)]
-    brightest = cv2.max(others[0], planes[0])
-    white = np.asarray(cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    """How far each place (n, W) rises in a channel and in its leads over the others; the channels below each other."""
     # The channels below each other: a third of the calls.
-    return _rise(np.concatenate(planes), np.concatenate(others), np.concatenate([white] * 3))
-
-
-def _rise(own: U8, others: NDArray[np.generic], white: U8) -> U8:
-    """How far each place (n, W) rises in a channel and in its lead over the others, whichever is less."""
-    # The lead is halved to fit eight bits.
-    lead = np.asarray(cv2.addWeighted(own, 0.5, np.asarray(others, np.uint8), -0.5, 128.0), np.uint8)
+    own, after, before = (np.concatenate([planes[(c + k) % 3] for c in range(3)]) for k in range(3))
+    brightest = cv2.max(cv2.max(own, after), before)
+    white = np.asarray(cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    # The leads are halved to fit eight bits.
+    leads = [np.asarray(cv2.addWeighted(own, 0.5, other, -0.5, 128.0), np.uint8) for other in (after, before)]
     width = own.shape[1]
-    rise = _lesser(own, lead, white, max(_NARROW_PX[0], width // _NARROW_PX[1]), 5)
+    rise = _least(own, leads, white, max(_NARROW_PX[0], width // _NARROW_PX[1]), 5)
     clipped = np.asarray(cv2.threshold(own, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
     if np.asarray(cv2.erode(clipped, np.ones((1, 3), np.uint8))).any():
         # A saturated core of some width may be wider than that.
         away = max(_BRIGHT_PX[0], width // _BRIGHT_PX[1])
-        wide = cv2.min(_lesser(own, lead, white, away, 2 * away + 1), clipped)
+        wide = cv2.min(_least(own, leads, white, away, 2 * away + 1), clipped)
         rise = np.asarray(cv2.max(rise, wide), np.uint8)
-    # White between red stripes rises in green, and in green's lead too; but it is not green.
-    leads = cv2.threshold(lead, 128 + _LEADS // 2, 255, cv2.THRESH_BINARY)[1]
-    bright = cv2.threshold(own, _NEARLY - 1, 255, cv2.THRESH_BINARY)[1]
-    return np.asarray(cv2.min(rise, cv2.max(leads, bright)), np.uint8)
+    return rise
 
 
-def _lesser(own: U8, lead: U8, white: U8, away: int, around: int) -> U8:
-    """The lesser rise (n, W) of a channel and of its lead, which white places are lent from `around` them."""
-    if white.any():
-        lent = cv2.dilate(cv2.subtract(lead, white), np.ones((1, around), np.uint8))
-        lead = np.asarray(cv2.copyTo(lent, white, lead.copy()), np.uint8)
-    half = _ridge(lead, away)
-    return np.asarray(cv2.min(cv2.add(half, half), _ridge(own, away)), np.uint8)
+def _least(own: U8, leads: Sequence[U8], white: U8, away: int, around: int) -> U8:
+    """The least rise (n, W) of a channel and of its leads, which white places are lent from `around` them."""
+    rise = _ridge(own, away)
+    for lead in leads:
+        half = _ridge(_lent(lead, white, around), away)
+        rise = np.asarray(cv2.min(cv2.add(half, half), rise), np.uint8)
+    return rise
+
+
+def _lent(lead: U8, white: U8, around: int) -> U8:
+    """A lead (n, W) whose white places have the largest of those within `around` columns that are not."""
+    if not white.any():
+        return lead
+    lent = cv2.dilate(cv2.subtract(lead, white), np.ones((1, around), np.uint8))
+    return np.asarray(cv2.copyTo(lent, white, lead.copy()), np.uint8)
 
 
 def _ridge(plane: U8, away: int) -> U8:
