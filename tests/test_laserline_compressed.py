@@ -100,3 +100,22 @@ def test_a_saturated_upright_line_is_not_moved_by_smeared_colour(phase: float) -
     off = line.column_px - column
     assert np.isfinite(off).mean() > 0.99
     assert abs(np.nanmean(off)) < 0.02 and np.nanstd(off) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("quality", "subsampling", "limit"),
+    [(75, "420", 0.025), (85, "422", 0.015), (90, "422", 0.0125)],  # of 0.7 red and 0.3 green: 0.036, 0.026, 0.018
+)
+def test_little_is_left_of_what_all_rows_of_an_upright_line_share(quality: int, subsampling: str, limit: float) -> None:
+    shared = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        column, width = 200.0 + 16.0 * rng.random(), rng.uniform(1.2, 2.2)
+        light = 0.3 * np.exp(-0.5 * ((np.arange(400.0) - column) / width) ** 2)
+        sensor = np.stack([share * light + 0.02 for share in (0.05, 0.12, 1.0)], axis=-1)
+        sensor = 255.0 * np.tile(sensor, (240, 1, 1)) ** (1 / 2.2) + 2.0 * rng.standard_normal((240, 400, 3))
+        picture = compressed(np.clip(np.rint(sensor), 0, 255).astype(np.uint8), quality, subsampling)
+        off = find_laser_line(picture, POOLED).column_px - column
+        assert np.isfinite(off).mean() > 0.99
+        shared.append(np.nanmean(off))
+    assert np.sqrt(np.mean(np.square(shared))) < limit

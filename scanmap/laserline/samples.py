@@ -21,11 +21,13 @@ REACH = 24  # [px] samples on either side of the column
 # Half of the fit's window, and the largest full width at half height it is for.
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
-# Share of the laser's own channel in the mixture, and of its light that a neighbouring channel sees.
-_OWN, _SHARE = 0.7, 0.12
 _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
 # Share of a channel (blue, green, red) in what it and its neighbour have of brightness (BT.601's weights).
 _BRIGHTNESS = (0.16, 0.66, 0.34)
+# How far the mixture goes from there to the laser's own channel, at the least, and for each grey level of noise: more
+# averages noise, less the errors that all rows of an upright line share. All the way where colour is stored finely.
+_COLOUR, _COLOUR_PER_NOISE = 0.1, 0.2
+_LIGHT = 0.12  # share of the laser's light that a neighbouring channel sees
 
 
 class Samples(NamedTuple):
@@ -36,6 +38,7 @@ class Samples(NamedTuple):
     beside: U8 | None  # of the neighbouring channel, where it knows more of the place; else None
     outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
     channel: int = -1  # of the laser, where `beside` is known
+    share: float = 1.0  # of that channel in the mixture with `beside`
 
     def of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
         """Samples (2 half + 1, n) of some rows, and 1 where they say more than "bright", else 0."""
@@ -43,7 +46,7 @@ class Samples(NamedTuple):
         y = self.lit[span, some].astype(np.float32)
         usable = self.seen[span, some] < SATURATED
         if self.beside is not None:
-            y = _mixed(y, self.beside[span, some], usable)
+            y = _mixed(y, self.beside[span, some], usable, self.share)
         if self.outside is not None:
             usable &= ~self.outside[span, some]
         return y, usable.astype(np.float32)
@@ -69,7 +72,7 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     """The samples around integer columns (N,) of rows (N,)."""
     lit, seen = sight.lit, sight.plane
     beside = outside = None
-    if sight.image is not None and sight.compressed:
+    if sight.image is not None and sight.colour < 1.0:
         across = strips(sight.image, row, column, REACH)
         y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
     else:
@@ -78,18 +81,22 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
-    return Samples(y, bright, beside, outside, sight.channel)
+    brightness = _BRIGHTNESS[sight.channel]
+    coarse = min(_COLOUR + _COLOUR_PER_NOISE * sight.noise, 1.0)
+    colour = sight.colour + (1.0 - sight.colour) * coarse
+    return Samples(y, bright, beside, outside, sight.channel, brightness + colour * (1.0 - brightness))
 
 
-def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_]) -> F32:
+def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: float) -> F32:
     """The laser's channel with the neighbouring one in it (n, N), as high as the laser's own; whole lines only.
 
     Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
-    colour, which is smeared. Two channels together hold more of the one and less of the other.
+    colour, which is smeared. Two channels together hold more of the one and less of the other. What JPEG rounds of
+    colour moves all rows of an upright line alike, which no pooling takes out.
     """
-    mixed = own * np.float32(_OWN)
-    mixed += beside * np.float32(1.0 - _OWN)
-    mixed *= np.float32(1.0 / (_OWN + (1.0 - _OWN) * _SHARE))
+    mixed = own * np.float32(share)
+    mixed += beside * np.float32(1.0 - share)
+    mixed *= np.float32(1.0 / (share + (1.0 - share) * _LIGHT))
     cut = np.flatnonzero(~usable.all(axis=0))
     mixed[:, cut] = own[:, cut]
     return mixed

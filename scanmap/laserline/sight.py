@@ -16,8 +16,9 @@ from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, w
 U8 = NDArray[np.uint8]
 
 
-# Noise of the difference of two channels over that of one, from which on they are independent.
-_INDEPENDENT = 1.2
+# Noise of the difference of two channels over that of one, from which on they are independent; below, in grey levels,
+# no difference is measured.
+_INDEPENDENT, _NONE = 1.2, 0.3
 
 
 class Conversion(NamedTuple):
@@ -39,7 +40,7 @@ class Sight(NamedTuple):
     image: U8 | None  # (H, W, 3) where colour tells the laser from other things
     channel: int  # of the image; -1 without one
     noise: float  # of a sample of lit [grey levels]
-    compressed: bool = False  # the channels of the image share their noise
+    colour: float = 1.0  # how finely it is stored: 0 where the channels' noise is one, 1 where they are independent
 
 
 def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
@@ -54,7 +55,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
         rows = np.asarray(cv2.extractChannel(quick_rows(image), channel), np.uint8)
         # Most of a large picture is never looked at.
         plane = image[..., channel] if is_large(image) else extract(image, channel)
-        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows), _compressed(image, channel))
+        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows), _fineness(image, channel))
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off = None
     if background is not None:
@@ -85,12 +86,13 @@ def _noise(plane: U8, rows: U8) -> float:
     return noise_of(rows if is_large(plane) else plane)
 
 
-def _compressed(image: U8, channel: int) -> bool:
-    """Whether the noise of the picture's channels is one: it went through JPEG, or through a camera's own matrix.
+def _fineness(image: U8, channel: int) -> float:
+    """How much of the noise of colour is there: less than 1 after JPEG, or after a camera's own matrix.
 
-    Independent noises differ by more than each, by the root of two.
+    Independent noises differ by more than each, by the root of two; what JPEG stores of colour, at fewer columns and
+    coarser steps, differs by less the coarser it is.
     """
-    rows = np.ascontiguousarray(image[:: max(1, len(image) // 8)])
+    rows = np.ascontiguousarray(image[:: max(1, len(image) // 8), ::2])
     own, other = (np.asarray(cv2.extractChannel(rows, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
-    difference = np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8)
-    return noise_of(difference) < _INDEPENDENT * noise_of(other)
+    difference = noise_of(np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8))
+    return min(difference / (_INDEPENDENT * noise_of(other)), 1.0) if difference > _NONE else 0.0
