@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from boards_by_projection import Head, picture_of, random_pose, seen
 
-from scanmap.errors import ConfigError
+from scanmap.errors import CalibrationError, ConfigError
 from scanmap.geometry import rigid, rotation_x, rotation_y
 from scanmap.solvers.board import parse_board
 from scanmap.solvers.board_sheet import draw_sheet
-from scanmap.solvers.detection import Rejected, View, find_board, seen_instead
+from scanmap.solvers.detection import Rejected, View, find_board
+from scanmap.solvers.other_boards import seen_instead
+from scanmap.solvers.pictures import Picture, collect
 
 CHESS = parse_board("chessboard:8x6:30mm")
 CHARUCO = parse_board("charuco:7x5:30mm:22mm")
@@ -131,11 +133,90 @@ def test_a_mirrored_picture_is_told_from_a_missing_board(charuco) -> None:
     assert "mirrored" in seen_instead(mirrored, CHARUCO)
 
 
-@pytest.mark.parametrize("said", ["chessboard:7x5:30mm", "chessboard:9x6:30mm", "chessboard:6x5:30mm"])
-def test_a_board_of_another_size_is_refused_by_its_own_size(chess, said: str) -> None:
-    found = find_board(chess, parse_board(said))
-    assert isinstance(found, Rejected)
-    assert "8x6" in found.reason + seen_instead(chess, parse_board(said))
+@pytest.mark.parametrize("said", ["7x5", "9x6", "6x5", "9x7", "12x8", "8x7"])
+def test_a_board_of_another_size_is_named(chess, said: str) -> None:
+    board = parse_board(f"chessboard:{said}:30mm")
+    found = collect([Picture(str(k), chess) for k in range(4)], board)
+    with pytest.raises(CalibrationError, match=r"use --board chessboard:8x6:30mm") as refused:
+        found.require()
+    assert f"has 8x6 inner corners (4 pictures), not {said}" in str(refused.value)
+
+
+@pytest.mark.parametrize("sought", ["5x6", "8x3", "4x6"])
+def test_part_of_a_chessboard_is_a_part(chess, sought: str) -> None:
+    """Covered on one side, numbered from its own first corner, where it truly is."""
+    T = in_front(CHESS)
+    truth = seen(HEAD, CHESS.points @ T[:3, :3].T + T[:3, 3]).reshape(6, 8, 2)
+    across, down = (int(k) for k in sought.split("x"))
+    kept = truth[:down, 8 - across :]
+    # A sheet of paper lies over the rest, from half a square beyond these corners on.
+    if across < 8:
+        hidden = truth[[0, -1], 7 - across : 9 - across].mean(axis=1)
+    else:
+        hidden = truth[down - 1 : down + 1, [0, -1]].mean(axis=0)
+    (x0, y0), along = hidden[0], hidden[1] - hidden[0]
+    v, u = np.mgrid[0 : chess.shape[0], 0 : chess.shape[1]]
+    cut = chess.copy()
+    cut[(u - x0) * along[1] - (v - y0) * along[0] < 0] = 120
+    view = find_board(cut, CHESS)
+    assert isinstance(view, View)
+    assert view.part in ((across, down), (down, across))
+    assert len(view.ids) >= across * down - 2
+    apart = np.linalg.norm(view.corners[:, None] - kept.reshape(-1, 2), axis=-1)
+    assert apart.min(axis=1).max() < 0.3
+    # Its own first corner is the board's (0, 0): a homography from its ids maps onto the corners.
+    H, _ = cv2.findHomography(CHESS.points[view.ids, :2], view.corners)
+    fitted = cv2.perspectiveTransform(CHESS.points[view.ids, None, :2], H)[:, 0]
+    assert np.abs(fitted - view.corners).max() < 1.0
+    assert np.linalg.det(H) * H[2, 2] > 0
+
+
+def test_a_hand_on_a_chessboard_costs_the_corners_under_it(chess) -> None:
+    T = in_front(CHESS)
+    truth = seen(HEAD, CHESS.points @ T[:3, :3].T + T[:3, 3])
+    covered = chess.copy()
+    cv2.circle(covered, tuple(np.rint(truth[19]).astype(int).tolist()), 30, (120, 140, 190), -1)
+    view = find_board(covered, CHESS)
+    assert isinstance(view, View)
+    assert view.part is None
+    assert 36 <= len(view.ids) <= 47
+    assert np.linalg.norm(view.corners[:, None] - truth, axis=-1).min(axis=1).max() < 0.3
+
+
+def test_views_that_show_only_parts_ask_for_the_whole(chess) -> None:
+    cut = np.ascontiguousarray(chess[:, 290:])
+    found = collect([Picture("one", cut)], CHESS)
+    assert found.views
+    with pytest.raises(CalibrationError, match="show all of it once"):
+        found.require()
+
+
+def test_markers_are_not_called_a_chessboard() -> None:
+    """A sheet of separate markers: right angles and four-fold corners, but no chessboard."""
+    sheet = np.full((480, 640), 235, np.uint8)
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_ARUCO_ORIGINAL)
+    for k in range(12):
+        row, column = divmod(k, 4)
+        sheet[40 + 140 * row : 140 + 140 * row, 60 + 140 * column : 160 + 140 * column] = cv2.aruco.generateImageMarker(
+            family, 7 * k + 3, 100
+        )
+    sheet = cv2.GaussianBlur(sheet, (0, 0), 0.8)
+    for board in (CHESS, CHARUCO):
+        assert isinstance(find_board(sheet, board), Rejected)
+        assert "chessboard of" not in seen_instead(sheet, board)
+        assert "inner corners" not in seen_instead(sheet, board)
+
+
+@pytest.mark.parametrize("name", ["charuco:7x5:30mm:22mm", "charuco:6x8:30mm:22mm", "charuco:9x6:30mm:20mm"])
+def test_another_charuco_board_is_named_by_its_own_markers(name: str) -> None:
+    board = parse_board(name)
+    picture = picture_of(HEAD, board, in_front(board, (0.0, 0.0, 0.5)), np.random.default_rng(5))
+    for said in ("charuco:5x4:30mm:22mm", "charuco:8x7:30mm:22mm", "charuco:5x7:30mm:22mm"):
+        found = collect([Picture("one", picture)], parse_board(said))
+        with pytest.raises(CalibrationError) as refused:
+            found.require()
+        squares = f"{board.columns}x{board.rows}"
+        assert f"use --board charuco:{squares}:30mm:22mm" in str(refused.value)
 
 
 def test_another_charuco_board_is_refused(charuco) -> None:

@@ -145,7 +145,18 @@ def solve_axis(job: BoardJob, base: Calibration) -> Solved:
             "scanmap calibrate laser comes first"
         )
     kept = _Kept()
-    views = collect(_pictures(job, turning=True), job.board, use=kept.keep, report=job.report)
+
+    def use(picture: Picture, view: View) -> Rejected | None:
+        if view.part is not None:
+            across, down = view.part
+            return Rejected(
+                view.name,
+                f"shows {across}x{down} corners of the chessboard, and which of them nobody can tell: the axis needs "
+                "all of it, or a ChArUco board",
+            )
+        return kept.keep(picture, view)
+
+    views = collect(_pictures(job, turning=True), job.board, use=use, report=job.report)
     views.require()
     base.check_image(*views.size)
     fit: AxisFit = calibrate_axis(views.views, job.board, base)

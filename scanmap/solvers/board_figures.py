@@ -118,8 +118,9 @@ def _over(
         return np.asarray(np.rint(16.0 * ((np.nan_to_num(at, nan=-99.0) + 0.5) * scale - 0.5)), np.int32)
 
     pose = board_pose(view, board, own)
-    across, down = board.corners
-    grid = project(board.points, pose.T_camera_board, own).reshape(down, across, 2)
+    shown = view.board_seen(board)
+    across, down = shown.corners
+    grid = project(shown.points, pose.T_camera_board, own).reshape(down, across, 2)
     strips = [pixels(strip) for strip in (*grid, *grid.transpose(1, 0, 2))]
     cv2.polylines(canvas, strips, False, GREEN, 1, cv2.LINE_AA, 4)
     for corner in pixels(view.corners):

@@ -63,13 +63,14 @@ def find_board_line(
         return Rejected(
             view.name, f"the board fits the camera only to {pose.rms_px:.1f} px rms: another camera or board?"
         )
-    window = board_window(pose, board, intrinsics, margin_m)
+    seen = view.board_seen(board)
+    window = board_window(pose, seen, intrinsics, margin_m)
     line = find_laser_line(image, params, background, window)
     rows = np.flatnonzero(line.reason == Reason.OK)
     if len(rows) < ROWS_LEAST:
         return Rejected(view.name, f"laser not visible on the board: {len(rows)} rows with a line, {ROWS_LEAST} needed")
     columns = line.column_px[rows]
-    inner = board_window(pose, board, intrinsics, 0.0)[rows]
+    inner = board_window(pose, seen, intrinsics, 0.0)[rows]
     on_squares = (columns >= inner[:, 0]) & (columns <= inner[:, 1])
     on_line = straight_rows(columns, rows.astype(np.float64), intrinsics, on_squares)
     fault = _fault(on_line, rows, columns, on_squares, board, pose, intrinsics)

@@ -61,6 +61,8 @@ def tilt_spread_deg(poses: Array) -> float:
 def hints(views: Sequence[View], poses: Array, size: tuple[int, int]) -> list[str]:
     """What to show next, most needed first; empty when there is enough."""
     wanted = []
+    if views and all(view.part is not None for view in views):
+        wanted.append("show the whole board once")
     if len(views) < VIEWS_GOOD:
         missing = VIEWS_GOOD - len(views)
         wanted.append("1 more view" if missing == 1 else f"{missing} more views")

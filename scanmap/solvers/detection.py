@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -10,16 +11,17 @@ from numpy.typing import NDArray
 
 from scanmap.shot import Image
 from scanmap.solvers.board import Board
+from scanmap.solvers.chessboard import Grid, find_part, find_whole
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+# Which of the board's points, where they are (N, 2) [px], a marker's side over a square's, and the part that is seen.
+_Found = tuple[Index, Array, float, tuple[int, int] | None]
 
 # A view counts from this share of the board's corners, and from this many.
 LEAST_SHARE, LEAST_CORNERS = 0.25, 8
 # [px] a corner may move when it is refined; one that moves further was none.
 MOVED_MOST_PX = 2.0
-# [px] a chessboard is looked for in pictures of about this size, at a glance and thoroughly.
-LOOKED_AT_PX, THOROUGHLY_PX = 1600, 800
 # [10 to 90 % of an edge, as a share of a square] beyond it corners are no longer found evenly.
 BLUR_MOST = 0.3
 # Of the board's median contrast: a corner with less lies in glare, in a shadow or under a finger.
@@ -38,6 +40,11 @@ class View(NamedTuple):
     dropped: int  # corners given up for glare, shadow or a bad fit
     bearing: float = float("nan")  # [rad] where the source knows it
     marker_ratio: float = float("nan")  # measured side of a marker over side of a square; ChArUco
+    part: tuple[int, int] | None = None  # columns, rows of the part of a chessboard that is seen; its place is unknown
+
+    def board_seen(self, board: Board) -> Board:
+        """The board as far as this view shows it: a part of a chessboard counts from its own first corner."""
+        return board if self.part is None else replace(board, columns=self.part[0], rows=self.part[1])
 
 
 class Rejected(NamedTuple):
@@ -45,15 +52,16 @@ class Rejected(NamedTuple):
 
     name: str
     reason: str
+    other: tuple[int, int] | None = None  # columns, rows of the chessboard that is there instead
 
 
 def find_board(image: Image, board: Board, name: str = "", bearing: float = float("nan")) -> View | Rejected:
     """Find the board in a grey (H, W) or BGR (H, W, 3) picture, laser on or off."""
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
     found = _charuco(grey, board) if board.kind == "charuco" else _chessboard(grey, board)
-    if isinstance(found, str):
-        return Rejected(name, found)
-    ids, corners, ratio = found
+    if isinstance(found, Rejected):
+        return found._replace(name=name)
+    ids, corners, ratio, part = found
     spacing = _spacing(board, ids, corners)
     if spacing < 5.0:
         return Rejected(name, f"squares of {spacing:.1f} px are too small to measure; come closer")
@@ -74,81 +82,47 @@ def find_board(image: Image, board: Board, name: str = "", bearing: float = floa
     fault = _not_flat(board, ids[keep], refined[keep], spacing)
     if fault:
         return Rejected(name, fault)
-    return View(name, ids[keep], refined[keep], blur, int((~keep).sum()), bearing, ratio)
+    return View(name, ids[keep], refined[keep], blur, int((~keep).sum()), bearing, ratio, part)
 
 
-def seen_instead(image: Image, board: Board) -> str:
-    """What a picture without the board shows in its place, as far as it can be told; empty if nothing."""
-    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-    if board.kind == "charuco":
-        if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board)[1]) >= 3:
-            return "the picture is mirrored: turn mirroring off in the camera"
-        _, ids = _markers(grey, board)
-        count = board.columns * board.rows // 2
-        others = [int(i) for i in ids if i >= count]
-        if others:
-            return f"marker {max(others)} is in sight, and {board.name} has 0 to {count - 1}: another board"
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(
-        grey, (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-    )
-    if not found or meta is None:
-        return ""
-    across, down = int(meta.shape[1]), int(meta.shape[0])
-    if board.kind == "charuco" or {across, down} != set(board.corners):
-        return f"a chessboard of {across}x{down} inner corners is in sight"
-    return ""
-
-
-def _chessboard(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
-    """A quick look at once, then a thorough one at a smaller picture: on clutter it costs a hundred times as much."""
+def _chessboard(grey: Image, board: Board) -> _Found | Rejected:
+    """A whole chessboard, or a part of it; where in the board that part lies nobody can tell."""
     across, down = board.corners
-    looks = (
-        (LOOKED_AT_PX, cv2.CALIB_CB_NORMALIZE_IMAGE),
-        (THOROUGHLY_PX, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
-    )
-    for size, flags in looks:
-        factor = max(1, round(max(grey.shape) / size))
-        less = (
-            cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA) if factor > 1 else grey
-        )
-        seen, corners, meta = cv2.findChessboardCornersSBWithMeta(less, (across, down), flags | cv2.CALIB_CB_LARGER)
-        if not seen:
-            continue
-        if meta is not None and {int(meta.shape[1]), int(meta.shape[0])} != {across, down}:
-            return f"a chessboard of {meta.shape[1]}x{meta.shape[0]} inner corners is in sight, not {across}x{down}"
-        if (int(meta.shape[1]), int(meta.shape[0])) == (across, down):
-            # A pixel of the smaller picture is the mean of a block.
-            whole = (np.asarray(corners, np.float64) + 0.5) * factor - 0.5
-            return np.arange(across * down), _right_handed(whole, across, down), np.nan
-    return "no board found"
+    whole = find_whole(grey, across, down)
+    grid = whole or find_part(grey)
+    if grid is None:
+        return Rejected("", "no board found")
+    both = (grid, Grid(np.ascontiguousarray(grid.corners.transpose(1, 0, 2))))
+    fitting = [each for each in both if each.shape[0] <= across and each.shape[1] <= down]
+    if not fitting:
+        other = grid.wide().shape
+        return Rejected("", f"a chessboard of {other[0]}x{other[1]} inner corners is in sight", other)
+    grid = _right_handed(fitting[0])
+    rows, columns = np.nonzero(grid.seen)
+    part = grid.shape if grid.shape != (across, down) else None
+    return rows * across + columns, grid.corners[rows, columns], np.nan, part
 
 
-def _right_handed(corners: Any, across: int, down: int) -> Array:
-    """Corners numbered so that x, y and the look at the board make a right-handed frame; a chessboard allows it."""
-    grid = np.asarray(corners, np.float64).reshape(down, across, 2)
-    x, y = grid[-1, -1] - grid[-1, 0], grid[-1, 0] - grid[0, 0]
-    return np.ascontiguousarray(grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]).reshape(-1, 2)
+def _right_handed(grid: Grid) -> Grid:
+    """Numbered so that x, y and the look at the board make a right-handed frame; a chessboard allows it."""
+    rows, columns = np.nonzero(grid.seen)
+    along = np.linalg.lstsq(np.c_[columns, rows, np.ones(len(rows))], grid.corners[rows, columns], rcond=None)[0]
+    return grid if np.linalg.det(along[:2]) > 0 else Grid(grid.corners[:, ::-1])
 
 
-def _markers(grey: Image, board: Board) -> tuple[Any, list[int]]:
-    detector = cv2.aruco.ArucoDetector(board.charuco().getDictionary(), cv2.aruco.DetectorParameters())
-    corners, ids, _ = detector.detectMarkers(grey)
-    return corners, [] if ids is None else [int(i) for i in ids.ravel()]
-
-
-def _charuco(grey: Image, board: Board) -> tuple[Index, Array, float] | str:
+def _charuco(grey: Image, board: Board) -> _Found | Rejected:
     pattern = board.charuco()
     corners, ids, squares, marks = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
     count = board.columns * board.rows // 2
     strange = [] if marks is None else [int(i) for i in marks.ravel() if i >= count]
     if len(strange) >= 2:
-        return f"markers {min(strange)} to {max(strange)} are in sight, and {board.name} has 0 to {count - 1}"
+        return Rejected("", f"marker {max(strange)} is in sight, and {board.name} has 0 to {count - 1}")
     if ids is None or corners is None or len(ids) < 4:
         seen = 0 if marks is None else len(marks)
-        return "no board found" if not seen else f"only {seen} markers of the board could be read"
+        return Rejected("", "no board found" if not seen else f"only {seen} markers of the board could be read")
     which = np.asarray(ids).ravel().astype(np.intp)
     where = np.asarray(corners, np.float64).reshape(-1, 2)
-    return which, where, _marker_ratio(board, which, where, squares)
+    return which, where, _marker_ratio(board, which, where, squares), None
 
 
 def _marker_ratio(board: Board, ids: Index, corners: Array, markers: Any) -> float:

@@ -17,7 +17,8 @@ from scanmap.recording.video import VIDEO_SUFFIXES
 from scanmap.shot import Image, Shot, decode_image
 from scanmap.solvers.board import Board
 from scanmap.solvers.coverage import is_new
-from scanmap.solvers.detection import Rejected, View, find_board, seen_instead
+from scanmap.solvers.detection import Rejected, View, find_board
+from scanmap.solvers.other_boards import seen_instead, wrong_size
 
 # Of a video without bearings this many pictures are taken, evenly.
 VIDEO_PICTURES = 120
@@ -47,15 +48,16 @@ class Views:
 
     def require(self) -> None:
         """Raise CalibrationError where no picture shows the board at all; says what they show."""
+        fault = wrong_size(self.board, self.views, self.rejected)
+        if fault:
+            raise CalibrationError(fault)
         if self.views:
             self._require_ratio()
             return
         if not self.rejected:
             raise CalibrationError("there is no picture to calibrate from")
-        why = self.instead or self.rejected[0].reason
-        raise CalibrationError(
-            f"{self.board.name} is in none of {len(self.rejected)} pictures: {why}; is --board what you printed?"
-        )
+        why = self.instead or f"{self.rejected[0].reason}; is --board what you printed?"
+        raise CalibrationError(f"{self.board.name} is in none of {len(self.rejected)} pictures: {why}")
 
     def _require_ratio(self) -> None:
         """Raise CalibrationError where the markers are not as large against the squares as the board's name says."""

@@ -1,0 +1,152 @@
+"""What pictures show where the board that was named is not in them, and the name it has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.shot import Image
+from scanmap.solvers.board import Board
+from scanmap.solvers.chessboard import find_part
+from scanmap.solvers.detection import Rejected, View
+
+Array = NDArray[np.float64]
+
+# Markers that must agree before anything is said about a board: any four lie as some board has them.
+MARKERS_LEAST, LAYOUT_LEAST = 4, 6
+# [share of the distance between markers] how far they may lie from where a layout has them.
+LAYOUT_OFF = 0.15
+SQUARES_MOST = 24
+FAMILIES = (
+    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
+)  # fmt: skip
+
+
+class Layout(NamedTuple):
+    """Squares of a ChArUco board as its marker numbers tell them."""
+
+    columns: int
+    rows: int  # at least
+
+
+def seen_instead(image: Image, board: Board) -> str:
+    """What a picture without the board shows in its place, as far as it can be told; empty if nothing."""
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    marks = _marks(grey, FAMILIES[0])
+    layout = layout_of(marks) if len(marks) >= LAYOUT_LEAST else None
+    if layout is not None and (board.kind != "charuco" or layout != (board.columns, board.rows)):
+        return _charuco_words(layout, board)
+    if board.kind == "charuco":
+        if len(_marks(np.ascontiguousarray(grey[:, ::-1]), FAMILIES[0])) >= MARKERS_LEAST > len(marks):
+            return "the picture is mirrored: turn mirroring off in the camera"
+        for family in FAMILIES[1:]:
+            if len(_marks(grey, family)) >= MARKERS_LEAST:
+                return f"its markers are of {family[5:]}, and scanmap reads 4X4 ones: print one with scanmap board"
+    grid = find_part(grey, thorough=True)
+    if grid is None and marks:
+        return f"only single markers are in sight ({', '.join(str(n) for n in sorted(marks)[:6])}), no board"
+    if grid is None:
+        return ""
+    across, down = grid.wide().shape
+    if board.kind == "charuco":
+        return (
+            f"a plain chessboard of {across}x{down} inner corners is in sight: use "
+            f"--board chessboard:{across}x{down}:{1e3 * board.square_m:g}mm"
+        )
+    return (
+        "" if across <= max(board.corners) and down <= min(board.corners) else _chessboard_words((across, down), board)
+    )
+
+
+def layout_of(marks: dict[int, Array]) -> Layout | None:
+    """Columns, and rows as far as markers are seen, of the ChArUco board on which markers with these numbers lie so.
+
+    Markers are counted row by row on the light squares; the first square is dark (OpenCV since 4.6).
+    """
+    numbers = np.array(sorted(marks))
+    centres = np.array([marks[int(number)].mean(axis=0) for number in numbers])
+    best, most = None, LAYOUT_LEAST - 1
+    for columns in range(3, SQUARES_MOST + 1):
+        cells = np.argwhere(np.indices((2 * int(numbers.max()) // columns + 3, columns)).sum(axis=0) % 2 == 1)
+        if numbers.max() >= len(cells):
+            continue
+        flat = cells[numbers][:, ::-1].astype(np.float64)
+        H, _ = cv2.findHomography(centres, flat, cv2.RANSAC, LAYOUT_OFF)
+        if H is None or np.linalg.matrix_rank(np.c_[flat - flat[0]]) < 2:
+            continue
+        off = np.linalg.norm(cv2.perspectiveTransform(centres[:, None], H)[:, 0] - flat, axis=1)
+        count = int((off < LAYOUT_OFF).sum())
+        # Counted in a wrong width a few markers lie right by chance.
+        if count > most and count >= 0.8 * len(numbers):
+            best, most = Layout(columns, int(flat[:, 1].max()) + 1), count
+    return best
+
+
+def wrong_size(board: Board, views: Sequence[View], rejected: Sequence[Rejected]) -> str:
+    """Why the board in the pictures is not the chessboard that was named, and what it is; empty if it may be.
+
+    Parts of a board count for less than a whole one: nobody knows what is cut off. Without any picture of the whole
+    board, what is there may be a smaller one.
+    """
+    whole = sum(view.part is None for view in views)
+    larger = Counter(each.other for each in rejected if each.other is not None)
+    if sum(larger.values()) > whole:
+        return _chessboard_words(_largest(larger), board, larger.total())
+    if whole or not views:
+        return ""
+    parts = Counter((max(view.part), min(view.part)) for view in views if view.part is not None)
+    size = _largest(parts)
+    if parts[size] >= 3 and 2 * parts[size] >= len(views):
+        return _chessboard_words(size, board, parts[size])
+    return (
+        f"no picture shows all of {board.name}, at most {size[0]}x{size[1]} inner corners: show all of it once, or use "
+        f"--board {_named(size, board)} if that is all it has"
+    )
+
+
+def _largest(sizes: Counter[tuple[int, int]]) -> tuple[int, int]:
+    """The largest size that is no single find, if there is one."""
+    often = [size for size, count in sizes.items() if count >= 2] or list(sizes)
+    return max(often, key=lambda size: (size[0] * size[1], sizes[size]))
+
+
+def _named(size: tuple[int, int], board: Board) -> str:
+    return replace(board, columns=size[0], rows=size[1]).name
+
+
+def _chessboard_words(size: tuple[int, int], board: Board, count: int = 1) -> str:
+    pictures = f" ({count} pictures)" if count > 1 else ""
+    return (
+        f"the board in the pictures has {size[0]}x{size[1]} inner corners{pictures}, not "
+        f"{board.columns}x{board.rows}: use --board {_named(size, board)}"
+    )
+
+
+def _charuco_words(layout: Layout, board: Board) -> str:
+    columns, rows = layout
+    marker = board.marker_m or 0.7 * board.square_m
+    name = replace(board, kind="charuco", columns=columns, rows=rows, marker_m=marker).name
+    if board.kind == "chessboard":
+        return (
+            f"a ChArUco board is in sight, {columns} squares wide and at least {rows} high: use --board such as {name}"
+        )
+    return (
+        f"the board in the pictures is {columns} squares wide and at least {rows} high, not "
+        f"{board.columns}x{board.rows}: use --board {name} (count the squares)"
+    )
+
+
+def _marks(grey: Image, family: str) -> dict[int, Array]:
+    """Corners (4, 2) of the markers in a picture by their numbers."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
+    found: Any = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters()).detectMarkers(grey)
+    corners, numbers = found[0], found[1]
+    if numbers is None:
+        return {}
+    return {int(n): np.asarray(c, np.float64).reshape(4, 2) for n, c in zip(numbers.ravel(), corners, strict=True)}
