@@ -232,30 +232,17 @@ def _baseline(calibration: Calibration) -> float:
 def _locate_on_plane(column: Array, row: Array, calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_]]:
     R, origin = calibration.T_head_camera[:3, :3], calibration.T_head_camera[:3, 3]
     plane = calibration.laser_plane
-    rays = calibration.intrinsics.rays(column, row) @ R.T
+    seen = calibration.intrinsics.rays(column, row)
+    rays = seen @ R.T
     t = intersect_rays_plane(origin, rays, plane)
     t[~(t > 0)] = np.nan  # beyond infinity the ray meets the plane behind the camera
     points = origin + t[:, None] * rays
-    d_rays = _rays_per_column(column, row, calibration) @ R.T
+    d_rays = calibration.intrinsics.rays_per_column(seen) @ R.T
     # d/du of o + t r with n.(o + t r) + d = 0.
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray parallel to the plane, whose t is NaN
         slip = (d_rays @ plane[:3]) / (rays @ plane[:3])
         slope = np.abs(t) * np.linalg.norm(d_rays - slip[:, None] * rays, axis=-1)
     return points, slope, np.zeros(len(column), dtype=bool)
-
-
-def _rays_per_column(column: Array, row: Array, calibration: Calibration) -> Array:
-    """Derivative (N, 3) of the camera's rays by the column: they are smooth, so a difference serves.
-
-    To one side alone where the other has no ray, at the rim of a folding lens.
-    """
-    step = 0.5
-    behind, here, ahead = (calibration.intrinsics.rays(column + s, row) for s in (-step, 0.0, step))
-    low, high = np.where(np.isnan(behind), here, behind), np.where(np.isnan(ahead), here, ahead)
-    span = step * (2.0 - np.isnan(behind[:, :1]) - np.isnan(ahead[:, :1]))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope: Array = (high - low) / span
-    return slope
 
 
 def _locate_by_depth(

@@ -57,6 +57,23 @@ class Intrinsics:
             xy[known] = found
         return np.concatenate([xy, np.ones((known.size, 1))], axis=1).reshape(*shape, 3)
 
+    def rays_per_column(self, rays: Array) -> Array:
+        """Derivative (..., 3) of `rays` (..., 3) by the pixel's column [1/px]: the distortion's Jacobian, inverted."""
+        if not self.distorted:
+            return np.broadcast_to(np.array([1.0 / self.fx, 0.0, 0.0]), rays.shape)
+        x, y = rays[..., 0], rays[..., 1]
+        k1, k2, p1, p2, k3 = self.distortion
+        xx, xy, yy = x * x, x * y, y * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        twice = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+        j_xx = radial + xx * twice + 2.0 * p1 * y + 6.0 * p2 * x
+        j_xy = xy * twice + 2.0 * p1 * x + 2.0 * p2 * y
+        j_yy = radial + yy * twice + 6.0 * p1 * y + 2.0 * p2 * x
+        with np.errstate(divide="ignore", invalid="ignore"):  # where a polynomial folds over
+            per_column = 1.0 / ((j_xx * j_yy - j_xy * j_xy) * self.fx)
+            return np.stack([j_yy * per_column, -j_xy * per_column, np.zeros_like(x)], axis=-1)
+
     def project(self, points_cam: Array) -> Array:
         """Pixels (..., 2) column, row of points (..., 3) [m] in the camera frame; NaN behind the camera."""
         with np.errstate(divide="ignore", invalid="ignore"):
