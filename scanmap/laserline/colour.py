@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates
+from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates, is_large, unit_of
 from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
 from scanmap.laserline.runs import numbered
@@ -29,6 +29,9 @@ _NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
 _FLANK = 15  # [grey levels] that a flank must rise by
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _HALF = 9  # [px] samples on either side of a line that its colour is measured from
+_SMEAR = 5  # [px] on either side of a line that its colour is smeared over
+_EDGE = 0.5  # height of an edge of brightness, over the line's, that its light cannot be told across
+_BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
 
@@ -75,18 +78,28 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     block, which = np.nonzero((candidates.snr > 3.0) & np.isnan(shares)[:, None])
     if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
         return doubt
-    profile, brightest = _profiles(image, block, candidates.column[block, which])
-    sides = profile[:, 0] + profile[:, 1] + profile[:, -2] + profile[:, -1]
-    height = profile[:, _HALF - 2 : _HALF + 3].sum(axis=1) * np.float32(0.2) - sides * np.float32(0.25)
-    own = np.maximum(height[:, channel], 1.0)
-    other = np.maximum(height[:, channel - 1], height[:, channel - 2])
-    saturated = brightest[:, channel] >= COLOURLESS
+    profile, brightest = _profiles(image, block, candidates.column[block, which], 1)
+    height = light_added(profile, channel)
+    saturated = brightest[channel] >= COLOURLESS
+    at = np.flatnonzero(saturated)
+    near, beyond = np.ones((2, len(block)), np.float32)
+    near[at], beyond[at] = _flank_lead(profile[..., at], channel)
+    # What hardly rises so near by is a wide thing: it is asked on the scale it was found on.
+    least = _BROAD * candidates.snr[block, which] * unit_of(noise, is_large(image))
+    at = np.flatnonzero(height[channel] < least)
+    if at.size and image.shape[1] > (2 * _HALF + 1) * _COARSE:
+        profile, brightest = _profiles(image, block[at], candidates.column[block, which][at], _COARSE)
+        near[at], beyond[at] = _flank_lead(profile, channel)
+        coarse = profile.reshape(2 * _HALF + 1, _COARSE, 3, -1).mean(axis=1)
+        height[:, at], saturated[at] = light_added(coarse, channel), brightest[channel] >= COLOURLESS
+    own = np.maximum(height[channel], 1.0)
+    other = np.maximum(height[channel - 1], height[channel - 2])
     share = np.full(candidates.snr.shape, np.nan, np.float32)
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
     share[:, 0] = shares
     share[block, which] = other / own
     at = np.flatnonzero(saturated)
-    near, beyond = _flank_lead(profile[at].transpose(1, 2, 0), channel)
+    near, beyond = near[at], beyond[at]
     # A core with no flank in sight is wider than lines are; what bars are is judged elsewhere.
     seen = np.where(near < 1.0, 1.0, _UNTOLD).astype(np.float32)
     coloured = seen * np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
@@ -127,8 +140,9 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
         return lost
     row, run = row[doubtful], run[doubtful]
     middle = np.rint(column[row]).astype(np.intp)
-    height, brightest = heights_of(image, row, middle)
-    clipped = brightest[channel] >= COLOURLESS
+    y = _across(image, row, middle)
+    height = light_added(y.astype(np.float32), channel)
+    clipped = y[_HALF, channel] >= COLOURLESS
     by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
     lost[row] = _white_beside(image, row, middle, channel, clipped, run)
     stranger = _in_other_channels(by_run, np.bincount(run), channel)[run]
@@ -179,6 +193,32 @@ def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.in
     return core * np.float32(0.2) - side * np.float32(0.25), y[_HALF]
 
 
+def light_added(y: F32, channel: int) -> F32:
+    """Light (3, N) by channel that N narrow places of profiles y (2 _HALF + 1, 3, N) add, a mean of five columns.
+
+    An edge of brightness looks like light of the room's colour. There it is asked again: how much light there is in the
+    laser's channel, of the columns next to the place; how far that leads the others, which an edge does not and which
+    cameras smear, over all columns it is smeared over.
+    """
+    left, right = 0.5 * (y[0] + y[1]), 0.5 * (y[-2] + y[-1])
+    side, middle = 0.5 * (left + right), y[_HALF - 2 : _HALF + 3].sum(axis=0)
+    added: F32 = 0.2 * middle - side
+    at = np.flatnonzero(np.abs(left[channel] - right[channel]) > _EDGE * added[channel])
+    if at.size:
+        y, side, middle = y[:, :, at], side[:, at], middle[:, at]
+        smeared = 0.2 * (y[_HALF - _SMEAR : _HALF + _SMEAR + 1].sum(axis=0) - (2 * _SMEAR + 1) * side)
+        near = middle[channel] + y[_HALF - 3, channel] + y[_HALF + 3, channel]
+        beside = y[[_HALF - 5, _HALF - 4, _HALF + 4, _HALF + 5], channel].sum(axis=0)
+        own = 0.2 * (near - 1.75 * beside)
+        again = smeared - smeared[channel] + own
+        share = [
+            np.maximum(h[channel - 1], h[channel - 2]) / np.maximum(h[channel], 1.0) for h in (again, added[:, at])
+        ]
+        better = at[share[0] < share[1]]
+        added[:, better] = again[:, share[0] < share[1]]
+    return added
+
+
 def _across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
     """Samples (2 _HALF + 1, 3, N) around N places of a picture (H, W, 3)."""
     length = 2 * _HALF + 1
@@ -187,19 +227,24 @@ def _across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
     return np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
 
 
-def _profiles(image: U8, block: Index, column: F32) -> tuple[F32, U8]:
-    """Mean profiles (N, 2 _HALF + 1, 3) of blocks' rows around candidates, and their brightest core samples (N, 3)."""
+def _profiles(image: U8, block: Index, column: F32, scale: int) -> tuple[F32, U8]:
+    """Mean profiles (scale (2 _HALF + 1), 3, N) of blocks' rows around N candidates, and their brightest cores (3, N).
+
+    Args:
+        scale: how much wider than the narrowest.
+    """
     height, width = image.shape[:2]
     row = np.minimum(block * BLOCK, height - BLOCK)
-    x = np.clip(np.rint(column).astype(np.intp), _HALF, width - 1 - _HALF)
-    length = 2 * _HALF + 1
-    runs = [runs_at(image, row + k, 3 * (x - _HALF), 3 * length) for k in range(BLOCK)]
+    length = (2 * _HALF + 1) * scale
+    first = np.clip(np.rint(column).astype(np.intp) - length // 2, 0, width - length)
+    runs = [runs_at(image, row + k, 3 * first, 3 * length) for k in range(BLOCK)]
     total, brightest = runs[0].astype(np.uint16), runs[0]
     for run in runs[1:]:
         total += run
         brightest = np.maximum(brightest, run)
-    core = brightest.reshape(-1, length, 3)[:, _HALF - 2 : _HALF + 3]
-    return (total * np.float32(1.0 / BLOCK)).reshape(-1, length, 3), core.max(axis=1)
+    core = brightest.reshape(-1, length, 3)[:, (_HALF - 2) * scale : (_HALF + 3) * scale].max(axis=1)
+    profile = (total * np.float32(1.0 / BLOCK)).reshape(-1, length, 3)
+    return profile.transpose(1, 2, 0), core.T
 
 
 def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
@@ -212,16 +257,17 @@ def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
     Returns:
         the share of all the light there, and that of the light above the samples' ends; 1 where no flank is seen.
     """
-    own, others = y[:, channel], np.maximum(y[:, channel - 1], y[:, channel - 2])
+    own, others = y[:, channel], (y[:, channel - 1], y[:, channel - 2])
     ends = [0, 1, -2, -1]
-    rise = np.where(np.maximum(own, others) < COLOURLESS, own - own[ends].min(axis=0), 0.0)
-    lead = own - others
+    rise = np.where(y.max(axis=1) < COLOURLESS, own - own[ends].min(axis=0), 0.0)
     index, half = np.arange(y.shape[2]), len(y) // 2
     left, right = rise[2:half].argmax(axis=0) + 2, rise[half:-2].argmax(axis=0) + half
-    leads, height = lead[left, index] + lead[right, index], rise[left, index] + rise[right, index]
+    light, height = own[left, index] + own[right, index], rise[left, index] + rise[right, index]
     hidden = np.minimum(rise[left, index], rise[right, index]) < _FLANK
-    near = leads / np.maximum(own[left, index] + own[right, index], 1.0)
-    beyond = (leads - 2.0 * lead[ends].mean(axis=0)) / np.maximum(height, 1.0)
+    leads = [light - other[left, index] - other[right, index] for other in others]
+    at_ends = [2.0 * (own[ends] - other[ends]).mean(axis=0) for other in others]
+    near = np.minimum(*leads) / np.maximum(light, 1.0)
+    beyond = np.minimum(leads[0] - at_ends[0], leads[1] - at_ends[1]) / np.maximum(height, 1.0)
     return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
 
 
