@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,16 @@ _EDGE = 0.5  # height of an edge of brightness, over the line's, that its light 
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
+
+
+class _Colours(NamedTuple):
+    """What N places show of their colour, arrays (N,)."""
+
+    own: F32  # height in the laser's channel [grey levels], at least 1
+    other: F32  # in that of the others where it is highest
+    saturated: Mask
+    near: F32  # see `_flank_lead`; 1 where not saturated
+    beyond: F32
 
 
 def blocks_of(image: U8, channel: int) -> U8:
@@ -78,44 +90,55 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     block, which = np.nonzero((candidates.snr > 3.0) & np.isnan(shares)[:, None])
     if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
         return doubt
-    profile, brightest = _profiles(image, block, candidates.column[block, which], 1)
-    height = light_added(profile, channel)
-    saturated = brightest[channel] >= COLOURLESS
-    at = np.flatnonzero(saturated)
-    near, beyond = np.ones((2, len(block)), np.float32)
-    near[at], beyond[at] = _flank_lead(profile[..., at], channel)
-    # What hardly rises so near by is a wide thing: it is asked on the scale it was found on.
-    least = _BROAD * candidates.snr[block, which] * unit_of(noise, is_large(image))
-    at = np.flatnonzero(height[channel] < least)
-    if at.size and image.shape[1] > (2 * _HALF + 1) * _COARSE:
-        profile, brightest = _profiles(image, block[at], candidates.column[block, which][at], _COARSE)
-        near[at], beyond[at] = _flank_lead(profile, channel)
-        coarse = profile.reshape(2 * _HALF + 1, _COARSE, 3, -1).mean(axis=1)
-        height[:, at], saturated[at] = light_added(coarse, channel), brightest[channel] >= COLOURLESS
-    own = np.maximum(height[channel], 1.0)
-    other = np.maximum(height[channel - 1], height[channel - 2])
+    column, response = candidates.column[block, which], candidates.snr[block, which] * unit_of(noise, is_large(image))
+    near_by = _colours(image, block, column, channel, 1)
+    # What hardly rises so near by is a wide thing: it is asked on the scale it was found on too.
+    broad = np.flatnonzero(near_by.own < _BROAD * response)
+    if image.shape[1] <= (2 * _HALF + 1) * _COARSE:
+        broad = broad[:0]
+    coarse = _colours(image, block[broad], column[broad], channel, _COARSE)
     share = np.full(candidates.snr.shape, np.nan, np.float32)
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
     share[:, 0] = shares
-    share[block, which] = other / own
-    at = np.flatnonzero(saturated)
-    near, beyond = near[at], beyond[at]
-    # A core with no flank in sight is wider than lines are; what bars are is judged elsewhere.
-    seen = np.where(near < 1.0, 1.0, _UNTOLD).astype(np.float32)
-    coloured = seen * np.maximum(_between(near, *_NEAR), _between(beyond, *_LEAD))
+    share[block, which] = near_by.other / near_by.own
+    share[block[broad], which[broad]] = coarse.other / coarse.own
     laser = _laser_share(candidates, share, shares)
-    if laser is None or laser > _COLOURLESS_SHARE:
-        doubt[block[at], which[at]] = coloured
-        return doubt
-    # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
-    excess = other - (max(laser, 0.0) + 0.4) * own
-    uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
-    factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * own), 0.0, 1.0)
-    # Where a laser of pure colour saturates white, what is beside the core still has the colour.
-    pure = seen * _between(beyond, *_LEAD) if laser < _PURE else _UNTOLD * coloured
-    factor[at] = np.maximum(factor[at], pure)
+    factor = _of_laser(near_by, laser, noise)
+    # A line on a wide thing counts for what it rises by itself.
+    part = np.minimum(near_by.own[broad] / response[broad], 1.0)
+    factor[broad] = np.maximum(part * factor[broad], _of_laser(coarse, laser, noise))
     doubt[block, which] = factor
     return doubt
+
+
+def _colours(image: U8, block: Index, column: F32, channel: int, scale: int) -> _Colours:
+    """What the rows of blocks (N,) show around columns (N,), on a scale."""
+    profile, brightest = _profiles(image, block, column, scale)
+    near, beyond = np.ones((2, len(block)), np.float32)
+    at = np.flatnonzero(brightest[channel] >= COLOURLESS)
+    if at.size:
+        near[at], beyond[at] = _flank_lead(profile[..., at], channel)
+    if scale > 1:
+        profile = profile.reshape(2 * _HALF + 1, scale, 3, -1).mean(axis=1)
+    height = light_added(profile, channel)
+    own, other = np.maximum(height[channel], 1.0), np.maximum(height[channel - 1], height[channel - 2])
+    return _Colours(own, other, brightest[channel] >= COLOURLESS, near, beyond)
+
+
+def _of_laser(seen: _Colours, laser: float | None, noise: float) -> F32:
+    """Factors (N,): 1 for the laser's colour, down to 0 for another."""
+    # A core with no flank in sight is wider than lines are; what bars are is judged elsewhere.
+    told = np.where(seen.near < 1.0, 1.0, _UNTOLD).astype(np.float32)
+    coloured: F32 = told * np.maximum(_between(seen.near, *_NEAR), _between(seen.beyond, *_LEAD))
+    if laser is None or laser > _COLOURLESS_SHARE:
+        return np.asarray(np.where(seen.saturated, coloured, 1.0), np.float32)
+    # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
+    excess = seen.other - (max(laser, 0.0) + 0.4) * seen.own
+    uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
+    factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * seen.own), 0.0, 1.0)
+    # Where a laser of pure colour saturates white, what is beside the core still has the colour.
+    pure = told * _between(seen.beyond, *_LEAD) if laser < _PURE else _UNTOLD * coloured
+    return np.asarray(np.where(seen.saturated, np.maximum(factor, pure), factor), np.float32)
 
 
 def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) -> Mask:
@@ -257,17 +280,20 @@ def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
     Returns:
         the share of all the light there, and that of the light above the samples' ends; 1 where no flank is seen.
     """
-    own, others = y[:, channel], (y[:, channel - 1], y[:, channel - 2])
-    ends = [0, 1, -2, -1]
-    rise = np.where(y.max(axis=1) < COLOURLESS, own - own[ends].min(axis=0), 0.0)
-    index, half = np.arange(y.shape[2]), len(y) // 2
+    own, others, half = y[:, channel], (channel - 1, channel - 2), len(y) // 2
+    rise = np.where(y.max(axis=1) < COLOURLESS, own - own[[0, 1, -2, -1]].min(axis=0), 0.0)
+    index = np.arange(y.shape[2])
     left, right = rise[2:half].argmax(axis=0) + 2, rise[half:-2].argmax(axis=0) + half
-    light, height = own[left, index] + own[right, index], rise[left, index] + rise[right, index]
     hidden = np.minimum(rise[left, index], rise[right, index]) < _FLANK
-    leads = [light - other[left, index] - other[right, index] for other in others]
-    at_ends = [2.0 * (own[ends] - other[ends]).mean(axis=0) for other in others]
-    near = np.minimum(*leads) / np.maximum(light, 1.0)
-    beyond = np.minimum(leads[0] - at_ends[0], leads[1] - at_ends[1]) / np.maximum(height, 1.0)
+    light = y[left, :, index] + y[right, :, index]
+    near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
+    # All of either side, for colour is smeared.
+    total = np.zeros((3, y.shape[2]), np.float32)
+    for side, ends in ((slice(2, half), [0, 1]), (slice(half, -2), [-2, -1])):
+        clear = y[side].max(axis=1, keepdims=True) < COLOURLESS
+        total += np.where(clear, y[side] - y[ends].mean(axis=0), 0.0).sum(axis=0)
+    beyond = np.clip(1.0 - total[list(others)].max(axis=0) / np.maximum(total[channel], 1.0), 0.0, 1.0)
+    beyond[total[channel] < _FLANK] = 0.0
     return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
 
 
