@@ -98,7 +98,9 @@ def test_inches_have_four_decimals_everywhere(board: Firmware) -> None:
     for line in ("$13=1", "G10 L2 P1 X2.54"):
         say(board, line)
     assert say(board, "G38.2 X-90 F600") == ["[PRB:-1.0000,0.0000,0.0000:1]", "ok"]
-    assert say(board, b"?") == ["<Idle|MPos:-1.0000,0.0000,0.0000|FS:0,0|WCO:0.1000,0.0000,0.0000>"]
+    assert say(board, b"?") == [
+        "<Idle|MPos:-1.0054,0.0000,0.0000|FS:0.0,0|Pn:P|WCO:0.1000,0.0000,0.0000>"
+    ]  # it braked behind the mark
     parameters = say(board, "$#")
     assert [line[1:4] for line in parameters[:-1]] == [
         *(f"G{n}" for n in (54, 55, 56, 57, 58, 59, 28, 30, 92)),
@@ -274,8 +276,8 @@ def test_homing_finds_the_switch_and_names_the_place(direction: int, switch: flo
     for line in ("$22=1", f"$23={direction}"):
         say(board, line)
     board.write(b"$H\n?")
-    assert b"<" not in board.read(1000)
-    assert listen(board)[-1] == "ok"
+    assert board.read(1000) == b""  # silent until it is done
+    assert listen(board) == [f"<Home|MPos:{place:.3f},0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>", "ok"]
     assert math.degrees(board.bearing) == pytest.approx(switch - math.copysign(1.0, switch), abs=0.02)
     assert f"MPos:{place:.3f}," in say(board, b"?")[0]
 

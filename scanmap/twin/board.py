@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ BUILD_INFO: dict[str, tuple[str, ...]] = {
         "[VER:1.1f.20240812:]",
         "[OPT:VNMSL,35,1024,3,0]",
         "[AXS:3:XYZ]",
-        "[NEWOPT:ENUMS,RT+,HOME]",
+        "[NEWOPT:ENUMS,RT{legacy},HOME]",
         "[FIRMWARE:grblHAL]",
         "[DRIVER:STM32F401CC]",
     ),
@@ -34,7 +35,9 @@ _DEFAULTS: dict[int, float] = {
     **{100: 80.0, 101: 250.0, 102: 250.0, 110: 3600.0, 111: 500.0, 112: 500.0},
     **{120: 360.0, 121: 10.0, 122: 10.0, 130: 200.0, 131: 200.0, 132: 200.0},
 }
+OF_GRBLHAL: dict[int, float] = {10: 511, 39: 1}  # what it reports; whether `?`, `!`, `~` count inside `$` lines
 _THREE_DECIMALS = {11, 12, 24, 25, 27} | {number for number in _DEFAULTS if number >= 100}
+_WHOLE_OUTSIDE = {30, 31}  # kept as they are, told without decimals
 _FLAGS = {4, 5, 6, 13, 20, 21, 22, 32}
 HOMING, HOMING_ONE_AXIS, HOMING_FIRST = 1, 2, 4  # bits of $22; the last two are grblHAL's
 
@@ -53,8 +56,8 @@ class Memory:
     def lines(self) -> list[str]:
         """The answer to `$$`."""
         return [
-            f"${number}={value:.3f}" if number in _THREE_DECIMALS else f"${number}={value:.0f}"
-            for number, value in self.settings.items()
+            f"${number}=" + decimal(value, 3 if number in _THREE_DECIMALS else 0)
+            for number, value in sorted(self.settings.items())
         ]
 
     def store(self, number: int, value: float, dialect: DialectName = "grbl") -> int:
@@ -63,18 +66,17 @@ class Memory:
             return 4
         if number not in self.settings:
             return 3
+        if number not in _THREE_DECIMALS | _WHOLE_OUTSIDE:
+            value = float(int(value) & (0xFFFF if dialect == "grblHAL" else 0xFF))  # as wide as the board keeps it
         if number == 0 and value < 3:
             return 6
         if number == 20 and value and not self.settings[22]:
             return 10
         if number in _FLAGS and not (number == 22 and dialect == "grblHAL"):
             value = float(bool(value))
-        elif number not in _THREE_DECIMALS:
-            value = float(int(value))
         self.settings[number] = value
         if number == 22 and not value:
             self.settings[20] = 0.0
-        self.writes += 1
         return 0
 
 
@@ -99,40 +101,19 @@ class Modes:
     tool: int = 0
     g92: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
-    def line(self) -> str:
+    def line(self, *, in_inches: bool) -> str:
         """The answer to `$G`."""
-        return f"[GC:{' '.join(self.codes.values())} T{self.tool} F{self.feed:g} S{self.speed:g}]"
+        feed = decimal(self.feed / 25.4, 1) if in_inches else decimal(self.feed, 0)
+        return f"[GC:{' '.join(self.codes.values())} T{self.tool} F{feed} S{decimal(self.speed, 0)}]"
 
 
-class StatusReport(NamedTuple):
-    """What a board knows when it is asked `?`."""
-
-    state: str
-    braking: bool  # a hold has not come to rest yet
-    position: NDArray[np.float64]  # machine position [units]
-    offset: NDArray[np.float64]  # work zero seen from machine zero [units]
-    speed: float  # [units/s]
-    laser_power: float
-    free: tuple[int, int]  # blocks of the planner, bytes of the receive buffer
-
-    def line(self, settings: dict[int, float], *, with_offset: bool, with_overrides: bool) -> str:
-        """As `$10` and `$13` want it; offset and overrides come with some reports only, as on the real board."""
-        mask = int(settings[10])
-        inch = 25.4 if settings[13] else 1.0
-        in_inches = bool(settings[13])
-        fields = [f"{self.state}:{int(self.braking)}" if self.state == "Hold" else self.state]
-        place = self.position - (0 if mask & 1 else self.offset)
-        fields.append(("MPos:" if mask & 1 else "WPos:") + triple(place, in_inches))
-        if mask & 2:
-            fields.append(f"Bf:{self.free[0]},{self.free[1]}")
-        fields.append(f"FS:{self.speed * 60 / inch:.0f},{self.laser_power:.0f}")
-        if with_offset:
-            fields.append("WCO:" + triple(self.offset, in_inches))
-        elif with_overrides:
-            fields.append("Ov:100,100,100" + ("|A:S" if self.laser_power else ""))
-        return f"<{'|'.join(fields)}>"
+def decimal(value: float, places: int) -> str:
+    """A number as the board writes it: single precision, halves away from zero."""
+    digits = math.floor(float(abs(np.float32(value)) * np.float32(10**places)) + 0.5)
+    whole, rest = divmod(digits, 10**places)
+    return ("-" if value < 0 else "") + f"{whole}" + (f".{rest:0{places}d}" if places else "")
 
 
 def triple(values: NDArray[np.float64], in_inches: bool) -> str:
     """Three coordinates [units] as the board writes them: three decimals, or four of inches."""
-    return ",".join(f"{value / 25.4:.4f}" if in_inches else f"{value:.3f}" for value in values)
+    return ",".join(decimal(value / 25.4, 4) if in_inches else decimal(value, 3) for value in values)

@@ -1,7 +1,7 @@
 """A GRBL 1.1 board that exists only here: bytes in, bytes out, and the truth about the head it turns.
 
-Faithful to gnea/grbl (doc/markdown: interface, commands, settings) as far as a turning axis and a laser go; it
-shares no code with the driver it is there to test. It has no thread: it lives whenever somebody looks at it,
+Faithful to gnea/grbl (doc/markdown: interface, commands, settings; protocol.c, report.c, limits.c, eeprom.c) as far
+as a turning axis and a laser go; it shares no code with the driver it is there to test. It has no thread: it lives whenever somebody looks at it,
 up to the present moment. In `instant` mode the present is a clock of its own, which jumps to the next event
 whenever somebody waits for an answer, so that a scan's moves cost no real time.
 """
@@ -11,19 +11,20 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
-from collections.abc import Generator
 from dataclasses import dataclass, field
 
-from scanmap.twin.board import BANNERS, HOMING, HOMING_FIRST, DialectName, Memory, StatusReport
-from scanmap.twin.executor import Executor
+from scanmap.twin.board import HOMING, HOMING_FIRST, OF_GRBLHAL, DialectName, Memory
+from scanmap.twin.main_loop import MainLoop
 from scanmap.twin.motion import Drivetrain
 from scanmap.twin.planner import Planner
+from scanmap.twin.receiver import UART_BYTES
 from scanmap.twin.serial_line import Faults, SerialLine
+from scanmap.twin.status_report import status_line
 
-RX_BYTES = {"grbl": 128, "grblHAL": 1023, "FluidNC": 256}
-LINE_CHARACTERS = 79
+ALARM_S = {"grbl": 0.5, "grblHAL": 0.1, "FluidNC": 0.0}  # the processor waits so long for `ALARM:n` to get out
+EEPROM_BYTE_S = 3.4e-3  # an AVR writes a byte of its memory so long, and hears nothing meanwhile
 
+_LEGACY = {ord("?"): 0x80, ord("~"): 0x81, ord("!"): 0x82}  # real-time commands and grblHAL's other names of them
 _CRITICAL_ALARMS = {1, 2}  # these halt the board until it is reset
 _DEAD_STOPS = {1, 3}  # in mid-way: these let the motor go even where $1 is 255
 
@@ -46,9 +47,11 @@ class Firmware:
         self._lock = threading.RLock()
         self._epoch = time.monotonic()
         self._now = 0.0
-        self._rx: deque[int] = deque()
+        if self.dialect == "grblHAL":
+            self.memory.settings |= OF_GRBLHAL
         self._line = SerialLine(self.faults)
-        self._executor: Executor
+        self._status_wanted = False
+        self.loop: MainLoop
         self._power_up()
 
     @property
@@ -70,7 +73,7 @@ class Firmware:
         """Whether the laser shines at this moment."""
         with self._lock:
             self._live()
-            return self._executor.laser_power > 0 and not self.laser_dead
+            return self.loop.executor.spindle.share > 0 and not self.laser_dead
 
     @property
     def motor_on(self) -> bool:
@@ -84,7 +87,7 @@ class Firmware:
         """As the status report names it, without its substate."""
         with self._lock:
             self._live()
-            return self._state()
+            return self.present_state
 
     def open(self) -> None:
         """The port was opened."""
@@ -111,14 +114,38 @@ class Firmware:
     def raise_alarm(self, code: int) -> None:
         """Stop dead, laser off, as grbl does on that alarm."""
         self.planner.abort(self._now)
-        self._executor.laser_power = 0.0
+        self.loop.executor.spindle.stop()
         self.alarm = True
         self.say(f"ALARM:{code}")
+        self.work(ALARM_S[self.dialect])
         if code in _DEAD_STOPS:
             self.release_motor()
-        if code in _CRITICAL_ALARMS:
-            self.message("Reset to continue")
-            self._halted = True
+        self._halting = code in _CRITICAL_ALARMS
+
+    def work(self, seconds: float) -> None:
+        """The processor is busy from now on: it takes bytes in and answers nothing, not even `?`."""
+        self._busy_until = self._now + seconds
+
+    def write_memory(self, size: int) -> None:
+        """Bytes of the EEPROM are written: an AVR has its interrupts off and loses what the host sends."""
+        self.memory.writes += 1
+        if self.dialect == "grbl":
+            self.work(size * EEPROM_BYTE_S)
+            self._deaf_until = self._busy_until
+
+    def answer_status(self) -> None:
+        """Send the report that was asked for, if one was."""
+        if self._status_wanted:
+            self._status_wanted = False
+            self.say(status_line(self))
+
+    def tell_offset(self) -> None:
+        """The work offset has changed: the next status report has it."""
+        self.loop.rare.offset_in = 0
+
+    def tell_overrides(self) -> None:
+        """The spindle has changed: the next status report says what is on."""
+        self.loop.rare.overrides_in = 0
 
     def wait(self, seconds: float) -> None:
         """Let time pass: sleeps, or moves the board's own clock."""
@@ -136,6 +163,8 @@ class Firmware:
                 return
             for byte in data:
                 self._receive(byte)
+                if self.instant or byte in b"\r\n":
+                    self._live()
             self._live()
 
     def read(self, size: int) -> bytes:
@@ -182,66 +211,29 @@ class Firmware:
         self.drivetrain.recount(0)
         must_home = HOMING_FIRST if self.dialect == "grblHAL" else HOMING
         self.alarm = self.must_home = bool(int(self.memory.settings[22]) & must_home)
-        self._restart()
+        self.restart()
 
-    def _restart(self) -> None:
-        self._rx.clear()
-        self._halted = self.asleep = self.homing = self.checking = self.restart_requested = False
-        self._reports = 0
-        self._executor = Executor(self)
-        self._main = self._run()
+    def restart(self) -> None:
+        """A new life; memory, position and alarm stay."""
+        self._uart = bytearray()  # what came while the processor was deaf
+        self._busy_until = self._deaf_until = -math.inf
+        self._halted = self._halting = self._reset_wanted = self._status_wanted = False
+        self.asleep = self.homing = self.checking = self.restart_requested = False
+        self.loop = MainLoop(self)
         self._wake = math.inf
         self.go_idle()
-
-    def _run(self) -> Generator[float, None, None]:
-        """The board's main loop; yields the time before which it has nothing to do."""
-        self.say("")
-        self.say(BANNERS[self.dialect])
-        if self.alarm and self.must_home and self.dialect == "grblHAL":
-            self.say("ALARM:11")
-            self.message("Homing cycle required")
-        elif self.alarm:
-            self.message("'$H'|'$X' to unlock")
-        else:
-            yield from self._executor.run_startup()
-        while True:
-            line = yield from self._read_line()
-            if self.faults.lose_lines > 0:
-                self.faults.lose_lines -= 1
-                continue
-            answer = 11 if len(line) > LINE_CHARACTERS else (yield from self._executor.execute(line))
-            self.say(f"error:{answer}" if answer else "ok")
-            if self.asleep:
-                self.message("Sleeping")
-                self.release_motor()
-            if self.restart_requested:
-                self._restart()
-                yield self._now  # the new life begins at once
-
-    def _read_line(self) -> Generator[float, None, str]:
-        """Upper case, without blanks and comments."""
-        line, comment = "", ""
-        while True:
-            while not self._rx or self.planner.held or self._halted or self.asleep:
-                yield math.inf
-            character = chr(self._rx.popleft())
-            if character in "\r\n":
-                return line
-            if comment:
-                comment = "" if (comment, character) == ("(", ")") else comment
-            elif character in "(;":
-                comment = character
-            elif character > " " and (character != "/" or self.dialect == "FluidNC"):
-                line += character.upper() if len(line) <= LINE_CHARACTERS else ""
 
     def _live(self, until: float | None = None) -> None:
         """Bring the board to the present."""
         if until is None:
             until = self._now if self.instant else time.monotonic() - self._epoch
         while True:
-            was_moving = self.planner.moving
+            was_moving, was_cancelling = self.planner.moving, self.planner.cancelling
             self.planner.advance(self._now)
-            self._wake = math.inf if self._halted else next(self._main)
+            self.loop.executor.follow_moves()
+            if was_cancelling and not self.planner.cancelling:
+                self.loop.executor.synchronise_position()
+            self._wake = self._compute()
             if self.planner.moving:
                 self._motor_on = True
             elif was_moving:
@@ -253,61 +245,76 @@ class Firmware:
         self._now = max(self._now, until)
         self.planner.advance(self._now)
 
+    def _compute(self) -> float:
+        """What the processor does now; returns when it must be looked at again."""
+        if self._now < self._busy_until:
+            return self._busy_until
+        late, self._uart = self._uart, bytearray()
+        for byte in late:
+            self._receive(byte)
+        if self._halting:  # a reset that came earlier is forgotten
+            self.message("Reset to continue")
+            self._halting, self._halted, self._reset_wanted = False, True, False
+        if self._reset_wanted and self._now >= self._busy_until:
+            self.loop.end()
+            self.restart()
+        if not self.homing and not (self._halted and self.dialect == "grbl"):
+            self.answer_status()
+        return self.loop.answer_halted() if self._halted else self.loop.next()
+
     def _receive(self, byte: int) -> None:
-        """One byte: acted on at once if it is a real-time command, else buffered while there is room."""
-        if byte == 0x18:
+        """One byte: a real-time command, or something for the main loop."""
+        if self._now < self._deaf_until:
+            if len(self._uart) < UART_BYTES:
+                self._uart.append(byte)
+            return
+        command = byte
+        if self.dialect == "grblHAL" and not (self.loop.receiver.keeps_text and not self.memory.settings[39]):
+            command = _LEGACY.get(byte, byte)
+        elif self.dialect != "grblHAL":
+            command = _LEGACY.get(byte, 0xFF if byte in _LEGACY.values() else byte)
+        if command == 0x18:
             self._soft_reset()
-        elif self.homing:
-            pass
-        elif byte == ord("?"):
-            self._report()
-        elif byte == ord("!"):
+        elif command == 0x80:
+            self._want_status()
+        elif command == 0x82:
             self._hold()
-        elif byte == ord("~"):
-            self.planner.resume(self._now)
-        elif byte == 0x85 and self.planner.jogging:
+        elif command == 0x81:
+            if not self.homing:
+                self.planner.resume(self._now)
+        elif command == 0x85 and self.planner.jogging:
             self.planner.cancel(self._now)
-        elif byte < 0x80 and len(self._rx) < RX_BYTES[self.dialect]:
-            self._rx.append(byte)
-        if self.instant or byte in b"\r\n":
-            self._live()
+        elif command < 0x80:
+            self.loop.receiver.add(byte)
 
     def _soft_reset(self) -> None:
-        if self.homing or self.planner.moving:
+        if self._reset_wanted:
+            return
+        if (self.homing or self.planner.moving) and not self._halting:
             self.raise_alarm(6 if self.homing else 3)
+        self.loop.executor.spindle.stop()
         self.planner.abort(self._now)
         self.alarm = self.alarm or self.asleep
-        self._restart()
+        self._reset_wanted = True
 
     def _hold(self) -> None:
-        if self.alarm or self.asleep or self.checking:
+        if self.alarm or self.asleep or self.checking or self.homing:
             return
         if self.planner.jogging:
             self.planner.cancel(self._now)
         else:
             self.planner.hold(self._now)
 
-    def _state(self) -> str:
+    @property
+    def present_state(self) -> str:
+        """The state as it stands, for the code that runs on the board."""
         flags = {"Sleep": self.asleep, "Alarm": self.alarm, "Home": self.homing, "Check": self.checking}
         flags |= {"Hold": self.planner.held, "Jog": self.planner.jogging, "Run": self.planner.busy}
         return next((name for name, is_so in flags.items() if is_so), "Idle")
 
-    def _report(self) -> None:
-        """The answer to `?`."""
-        if self._halted and self.dialect == "grbl":
-            return
+    def _want_status(self) -> None:
+        """`?`: answered as soon as the processor looks, and once however often it was asked meanwhile."""
         if self.faults.lose_status > 0:
             self.faults.lose_status -= 1
-            return
-        turn = self._reports % (30 if self.planner.busy else 10)
-        self._reports += 1
-        report = StatusReport(
-            state=self._state(),
-            braking=self.planner.moving,
-            position=self.planner.position(),
-            offset=self._executor.work_offset(),
-            speed=self.planner.speed(self._now),
-            laser_power=self._executor.laser_power,
-            free=(self.planner.free_blocks, RX_BYTES[self.dialect] - len(self._rx)),
-        )
-        self.say(report.line(self.memory.settings, with_offset=turn == 0, with_overrides=turn == 1))
+        else:
+            self._status_wanted = True

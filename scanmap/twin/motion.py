@@ -29,7 +29,7 @@ class DriveParams(BaseModel, frozen=True, extra="forbid"):
 class Move:
     """A straight move from rest to rest with limited speed and acceleration.
 
-    `start` and `end` are machine positions of the three axes [units]; `spindle` is switched where a move begins.
+    `start` and `end` are machine positions of the three axes [units]; the spindle gets `power` where a move begins.
     """
 
     start: NDArray[np.float64]
@@ -38,6 +38,7 @@ class Move:
     acceleration: float  # [units/s^2]
     start_time: float  # [s]
     is_jog: bool = False
+    power: float = 0.0  # S word of a move under M3 or M4
 
     @property
     def length(self) -> float:
@@ -93,6 +94,7 @@ class Move:
             acceleration=self.acceleration,
             start_time=time,
             is_jog=self.is_jog,
+            power=self.power,
         )
 
     def _ramp_s(self) -> float:

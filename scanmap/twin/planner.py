@@ -28,6 +28,8 @@ class Planner:
         self._waiting: list[Move] = []  # what a hold put off
         self.steps = np.zeros(3, np.int64)  # the step counters: position as the board believes it
         self.held = False
+        self.cancelling = False  # a jog brakes, and what is left of it is forgotten
+        self._power: float | None = None
 
     def set_steps_per_unit(self, steps: Position) -> None:
         """`$100` to `$102` [steps/unit]; the counters stay, so the position reported changes."""
@@ -81,26 +83,47 @@ class Planner:
         """Speed at this moment [units/s]."""
         return self._moves[0].speed_at(now) if self._moves else 0.0
 
-    def add(self, target: Position, speed: float, acceleration: float, now: float, is_jog: bool = False) -> None:
+    def take_power(self) -> float | None:
+        """Power of the move begun last, if one began since this was asked last."""
+        power, self._power = self._power, None
+        return power
+
+    def add(
+        self,
+        target: Position,
+        speed: float,
+        acceleration: float,
+        now: float,
+        *,
+        is_jog: bool = False,
+        power: float = 0.0,
+    ) -> None:
         """Queue a move to `target` [units], rounded to whole steps."""
         start = self.target()
         end = np.rint(target * self._steps_per_unit) / self._steps_per_unit
         if np.array_equal(start, end):
             return
         begin = self._moves[-1].end_time if self._moves else now
-        move = Move(start, end, speed, acceleration, begin, is_jog)
+        move = Move(start, end, speed, acceleration, begin, is_jog, power)
         (self._waiting if self.held else self._moves).append(move)
 
     def advance(self, now: float) -> None:
         """Make the steps that are due."""
         while self._moves and self._moves[0].end_time <= now:
-            self._step_to(self._moves.popleft().end)
+            done = self._moves.popleft()
+            self._power = done.power
+            self._step_to(done.end)
         if self._moves:
+            self._power = self._moves[0].power
             self._step_to(self._moves[0].position(now))
+        else:
+            self.cancelling = False
 
     def hold(self, now: float) -> None:
         """Brake, and put off the rest."""
         self.advance(now)
+        if self.held:
+            return
         self.held = True
         if self._moves:
             present, *rest = self._moves
@@ -108,25 +131,29 @@ class Planner:
             self._moves = deque([present.braked(now)])
 
     def resume(self, now: float) -> None:
-        """Go on with what a hold put off."""
+        """Go on with what a hold put off; does nothing before it stands."""
         self.advance(now)
+        if self.moving:
+            return
         self.held = False
         waiting, self._waiting = self._waiting, []
         for move in waiting:
-            self.add(move.end, move.speed, move.acceleration, now, move.is_jog)
+            self.add(move.end, move.speed, move.acceleration, now, is_jog=move.is_jog, power=move.power)
 
     def cancel(self, now: float) -> None:
         """Brake and forget the rest: a jog cancel."""
         self.hold(now)
         self._waiting = []
         self.held = False
+        self.cancelling = self.moving
 
     def abort(self, now: float) -> None:
         """Stop dead and forget everything: a reset."""
         self.advance(now)
         self._moves.clear()
         self._waiting = []
-        self.held = False
+        self.held = self.cancelling = False
+        self._power = None
 
     def set_counter(self, axis: int, steps: int) -> None:
         """Name the present position of an axis anew: homing, power-up."""

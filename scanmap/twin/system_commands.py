@@ -24,6 +24,8 @@ Answer = Generator[float, None, int]  # grbl's error number, 0 for ok
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
 _SPINDLE_SETTINGS = {30, 31, 32}  # writing them starts the output anew, switched off
+_INCHES = 13
+_BYTES_OF_A_SETTING = 5  # a number and the checksum
 _SEARCH = 1.5  # homing looks as far as this times $130
 
 
@@ -43,18 +45,24 @@ class SystemCommands:
             return (yield from self._executor.jog(command[2:]))
         anytime: dict[str, Callable[[], None]] = {
             "": self._help,
-            "G": lambda: board.say(self._executor.modes.line()),
+            "G": lambda: board.say(self._executor.modes.line(in_inches=bool(board.memory.settings[13]))),
         }
         if command in anytime:
             anytime[command]()
             return 0
         if command == "X":
             return self._unlock()
+        if command == "$" and board.planner.jogging:
+            return self._idle_command(command)
         if board.planner.busy or (board.checking and command not in ("$", "C")):
             return 8
+        if command[:3] in ("N0=", "N1=") and not board.alarm:
+            return (yield from self._store_startup(int(command[1]), command[3:]))
         if command == "H" or (command == "HX" and board.dialect != "grbl"):
             return (yield from self._home(alone=command == "HX"))
-        return self._idle_command(command)
+        error = self._idle_command(command)
+        yield board.present  # it may take its time
+        return error
 
     def _help(self) -> None:
         self._board.say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
@@ -81,7 +89,7 @@ class SystemCommands:
         """Commands that need a board at rest."""
         board, memory = self._board, self._board.memory
         reports = {
-            "I": BUILD_INFO[board.dialect],
+            "I": [line.format(legacy="+" if memory.settings.get(39) else "-") for line in BUILD_INFO[board.dialect]],
             "N": [f"$N{number}={line}" for number, line in enumerate(memory.startup)],
             "#": self._parameters(),
         }
@@ -93,12 +101,9 @@ class SystemCommands:
             return 0
         if board.alarm and (command == "C" or command[:3] in ("N0=", "N1=")):
             return 8
-        if command[:3] in ("N0=", "N1="):
-            memory.startup[int(command[1])] = command[3:]
-            memory.writes += 1
-        elif command == "SLP":
+        if command == "SLP":
             board.asleep = True
-            self._executor.laser_power = 0.0
+            self._executor.spindle.stop()
         elif command == "C":
             board.checking = not board.checking
             board.message("Enabled" if board.checking else "Disabled")
@@ -106,6 +111,16 @@ class SystemCommands:
         else:
             return self._fluidnc(command) if board.dialect == "FluidNC" else self._store(command)
         return 0
+
+    def _store_startup(self, number: int, line: str) -> Answer:
+        """Keep a line for the next start; it is carried out now, to see whether it is good."""
+        error = yield from self._executor.gcode(line)
+        if not error:
+            yield from self._executor.synchronise()
+            self._board.memory.startup[number] = line
+            self._board.write_memory(len(line) + 2)
+            yield self._board.present
+        return error
 
     def _fluidnc(self, command: str) -> int:
         """FluidNC has its machine in a YAML tree and no numbered settings to write."""
@@ -139,10 +154,15 @@ class SystemCommands:
             return 2
         if value.end() != len(rest) or float(number[0]) > 255:
             return 3
-        error = self._board.memory.store(int(float(number[0])), float(value[0]), dialect)
+        index = int(float(number[0]))
+        error = self._board.memory.store(index, float(value[0]), dialect)
+        if not error:
+            self._board.write_memory(_BYTES_OF_A_SETTING)
         self._executor.apply_steps()
-        if int(float(number[0])) in _SPINDLE_SETTINGS and not error:
-            self._executor.laser_power = 0.0
+        if index in _SPINDLE_SETTINGS and not error:
+            self._executor.spindle.stop()
+        if index == _INCHES:
+            self._board.tell_offset()
         return error
 
     def _home(self, *, alone: bool) -> Answer:
@@ -158,22 +178,32 @@ class SystemCommands:
         found = 0 <= distance <= _SEARCH * settings[130]
         travel = distance if found else _SEARCH * settings[130]
         yield from self._creep(toward * travel, settings[25])
-        if found:
-            yield from self._creep(-toward * settings[27], settings[24])
-        board.homing = False
+        if found:  # touched twice, the second time slowly
+            yield from self._creep(-toward * settings[27], settings[25])
+            yield from self._creep(toward * settings[27], settings[24])
+            yield from self._creep(-toward * settings[27], settings[25])
         if not found:
+            board.homing = False
             board.raise_alarm(9)
+            yield board.present
             board.restart_requested = True
             return 0
         place = -settings[27] if toward > 0 else settings[27] - settings[130]
         board.must_home = False
         board.planner.set_counter(0, round(place * settings[100]))
+        self._executor.synchronise_position()
+        board.answer_status()  # asked in the meantime; it still says Home
+        board.homing = False
         board.go_idle()
-        yield from self._executor.run_startup()
+        if not alone:
+            yield from board.loop.run_startup()
         return 0
 
     def _creep(self, distance: float, rate: float) -> Wait:
         target = self._board.planner.position()
         target[0] += distance
-        self._executor.plan(target, rate, is_jog=False)
+        self._executor.plan(target, rate, 0.0)
         yield from self._executor.synchronise()
+        settled = self._board.present + self._board.memory.settings[26] / 1e3
+        while self._board.present < settled:
+            yield settled
