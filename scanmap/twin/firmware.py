@@ -1,9 +1,9 @@
 """A GRBL 1.1 board that exists only here: bytes in, bytes out, and the truth about the head it turns.
 
 Faithful to gnea/grbl (doc/markdown: interface, commands, settings; protocol.c, report.c, limits.c, eeprom.c) as far
-as a turning axis and a laser go; it shares no code with the driver it is there to test. It has no thread: it lives whenever somebody looks at it,
-up to the present moment. In `instant` mode the present is a clock of its own, which jumps to the next event
-whenever somebody waits for an answer, so that a scan's moves cost no real time.
+as a turning axis and a laser go; it shares no code with the driver it is there to test. It has no thread: it lives
+whenever somebody looks at it, up to the present moment. In `instant` mode the present is a clock of its own, which
+jumps to the next event whenever somebody waits for an answer, so that a scan's moves cost no real time.
 """
 
 from __future__ import annotations
