@@ -12,13 +12,18 @@ _MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, be
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 
 
-def noise_variance(residual: F32, weight: F32) -> F32:
+def noise_variance(residual: F32, weight: F32, fitted: F32 | float = 4.0) -> F32:
     """Variance (N,) of a sample of weight 1: the rows' own, its median over neighbouring rows.
+
+    Args:
+        residual: (n, N) what the fit leaves over.
+        weight: (n, N) of the samples.
+        fitted: (N,) parameters that each row's samples were fitted with.
 
     A row far worse than its neighbours (an edge, a second line) keeps its own.
     """
     count = (weight > 0).view(np.uint8).sum(axis=0, dtype=np.uint8)
-    freedom = np.maximum(count.astype(np.float32) - np.float32(4.0), np.float32(1.0))
+    freedom = np.maximum(count.astype(np.float32) - fitted, np.float32(1.0))
     own = dot(weight * residual, residual) / freedom
     groups = -(-len(own) // _ROWS_POOLED)
     filled = np.empty(groups * _ROWS_POOLED, np.float32)

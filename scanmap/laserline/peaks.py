@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.dim import DimRows, dim_rows
 from scanmap.laserline.noise import dot, noise_variance, speckle_contrast
 from scanmap.laserline.samples import levelled
 
@@ -87,6 +88,9 @@ def fit_gaussian(
         part = part[:0]
     if part.size:
         fit = fit.with_rows(part, _fit_part(y[:, part], x, usable[:, part], start.of(part), least))
+    dim = dim_rows(y, x, cut, fit.s, fit.A, sample_noise)
+    if dim is not None:
+        fit = fit.with_rows(dim.rows, _Fit(dim.u, dim.s, dim.A, dim.b, dim.s * np.float32(0.5 * _ROOT_PI)))
     look = _Look(y, x, fit)
     if part.size:
         look.weight[:, part] = usable[:, part] * _near(x, fit.of(part), _REACH, least)
@@ -100,18 +104,31 @@ def fit_gaussian(
         fit, weight = _fit_speckle(y, x, usable, fit, sample_noise, contrast)
         look = _Look(y, x, fit)
         look.weight = weight
-    return _peaks(fit, look, clipped, cut, contrast)
+    return _peaks(fit, look, clipped, cut, contrast, dim)
 
 
-def _peaks(fit: _Fit, look: _Look, clipped: NDArray[np.bool_], cut: NDArray[np.intp], contrast: float) -> Peaks:
+def _peaks(
+    fit: _Fit,
+    look: _Look,
+    clipped: NDArray[np.bool_],
+    cut: NDArray[np.intp],
+    contrast: float,
+    dim: DimRows | None,
+) -> Peaks:
     """What the fits say, and how well; `cut`: the rows some of whose samples say little."""
     # Of a saturated core the fit's height is a guess; that it rises to saturation is known.
     A = np.where(clipped, np.maximum(fit.A, SATURATED - fit.b), fit.A)
-    variance = noise_variance(look.residual, look.weight)
+    fitted = np.full(len(fit.u), 4.0, np.float32)
+    if dim is not None:
+        fitted[dim.rows] = 3.0
+    variance = noise_variance(look.residual, look.weight, fitted)
     # Cramer-Rao with the other three parameters unknown.
-    sigma = np.sqrt(variance / np.maximum(fit.information, np.float32(1e-6))) * fit.s / fit.A
+    own = np.sqrt(variance / np.maximum(fit.information, np.float32(1e-6))) * fit.s
     # A and s are estimates too: what scatters them makes the bound itself too small by their variance.
+    sigma = own / fit.A
     sigma *= np.float32(1.0) + np.float32(_CURVED) * np.square(np.minimum(sigma / fit.s, np.float32(0.4)))
+    if dim is not None:
+        sigma[dim.rows] = own[dim.rows] / dim.height
     slope = look.slope
     slope *= look.weight
     odd = np.square(look.z)

@@ -150,8 +150,8 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
 def _risk(significance: Array) -> Array:
     """Mean square error (N,) of shrunk bends, in their variance, from their chi^2 nearby.
 
-    Without a bend 0.3 is left of it, at its worst (a bend of 3 standard deviations) 1.5. Stein's unbiased estimate (1981)
-    of the risk of x^3 / (x^2 + 2), which single rows scatter too much to give.
+    Without a bend 0.3 is left of it, at the worst, where it is 3 standard deviations, 1.5. Stein's unbiased estimate
+    (1981) of the risk of x^3 / (x^2 + 2), which single rows scatter too much to give.
     """
     doubtful = significance + _BEND_DOUBT
     own = 1.0 + (6.0 * _BEND_DOUBT * significance / doubtful - 2.0 * _BEND_DOUBT) / doubtful

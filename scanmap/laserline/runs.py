@@ -12,7 +12,8 @@ Mask = NDArray[np.bool_]
 
 NO_BLOB_PX = 2.3  # what is no wider, as sigma, can be a line at any resolution
 _NEAR = 140.0  # [grey levels] what is brighter can be a near line, wide by its own light
-_CERTAIN, _BRIGHT = 0.06, 40.0  # sigma_px over width_px, and peak, of a row that is surely a line
+# Sigma_px over width_px, and peak, of a row that is surely a line; and of one that may be, if noise allows no better.
+_CERTAIN, _BRIGHT, _POSSIBLE = 0.06, 40.0, 0.15
 _UNEVEN_PX, _UNEVEN_HEIGHT = 3.0, 14.0
 _INNER = 8  # rows of a run long enough to have ends and an inside
 _NEAR_ROWS = 6  # between the rows found above and below one that is too dim alone
@@ -63,7 +64,8 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) 
     found = np.flatnonzero(np.isfinite(column))
     # Known as well as the noise allows, or simply well.
     bound = 1.062 * np.sqrt(width[found]) * max(noise, 1.0) / peak[found]
-    certain = (sigma[found] < np.maximum(1.3 * bound, _CERTAIN * width[found])) | (peak[found] > _BRIGHT)
+    known = np.minimum(np.maximum(1.3 * bound, _CERTAIN * width[found]), _POSSIBLE * width[found])
+    certain = (sigma[found] < known) | (peak[found] > _BRIGHT)
     if certain.sum() < 0.25 * len(found):
         # Nothing here is surely a line, and what is wide is the room's.
         mask[found[width[found] > NO_BLOB_PX]] = True
