@@ -54,11 +54,79 @@ def test_real_distances_of_another_head(tmp_path: Path) -> None:
     assert pairs.distance_m.max() == 2.45
     found = errors(pairs, width=240, baseline=0.0225)
     assert np.abs(found["pixel_angle by distance"]).max() < 0.025
-    assert np.abs(found["pinhole fitted"]).max() < 0.026
+    assert np.abs(found["pinhole fitted"]).max() < 0.025
     assert "pinhole with x fitted" not in found
     held_out = errors(pairs, chosen=[2, 1, 5], width=240, baseline=0.0225)
     for name in ("pinhole fitted", "pixel_angle by distance"):
         assert np.abs(held_out[name][[0, 3, 4]]).max() < 0.02
+
+
+def test_a_pair_noted_twice_counts_once() -> None:
+    nan = np.full(5, np.nan)
+    column, distance = np.array([530.0, 698.0, 848.0, 1072.0, 1264.0]), np.array([0.3, 0.2, 0.15, 0.101, 0.078])
+    once = fit_table(Pairs(column, distance, nan, nan), 1600, 0.08, np.arange(5))
+    again = [0, 1, 1, 1, 2, 3, 4]
+    twice = fit_table(Pairs(column[again], distance[again], nan[again], nan[again]), 1600, 0.08, np.arange(7))
+    assert twice.pinhole == once.pinhole
+    assert twice.angle == once.angle
+
+
+YML = """# rows of a horizontal line
+readings: [99, 101, -1, 81, 108, 116]
+distances:
+    0: 350
+    1: 400
+    3: 180
+    4: 650
+    5: 2450
+h: 22.5
+image_width: 320
+image_height: 240
+"""
+
+
+def test_the_range_finders_own_file_brings_its_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = tmp_path / "calibrate.yml", tmp_path / "head.toml"
+    path.write_text(YML)
+    code, said, _ = run(capsys, str(path), "--out", str(out))
+    assert code == 0
+    assert "columns 81 to 116 of 240, 0.18 to 2.45 m, baseline 22.5 mm" in said
+    assert "best: Algorithm 2 by distance" in said
+    head = Calibration.load(out)
+    # The line lies along the rows there; scanmap's image stands on its side.
+    assert (head.intrinsics.width, head.intrinsics.height) == (240, 320)
+    assert abs(head.baseline_m) == pytest.approx(0.0225)
+    code, said, _ = run(capsys, str(path), "--baseline-mm", "25")
+    assert "baseline 25 mm" in said
+    for old, new, words in (
+        ("    1: 400", "    2: 400", "no reading at column 2"), ("h: 22.5\n", "", "lacks h"),
+        ("h: 22.5", "h: far", "could not convert"), ("    1: 400", "    1: -4", "above 0"), (YML, "a: [", "no YAML"),
+    ):  # fmt: skip
+        path.write_text(YML.replace(old, new))
+        code, _, complaint = run(capsys, str(path))
+        assert code == 2 and words in complaint and complaint.count("\n") == 1
+
+
+def test_the_real_file_within_two_and_a_half_per_cent(data: Path) -> None:
+    pairs = read_pairs(data / "real" / "laser-range-finder" / "data" / "calibrate.yml")
+    assert pairs.head is not None
+    assert (pairs.head.width, pairs.head.height, pairs.head.baseline_m) == (240, 320, 0.0225)
+    found = errors(pairs, width=240, baseline=0.0225)
+    assert np.abs(found["pinhole fitted"]).max() < 0.025
+    three = [int(np.flatnonzero(pairs.distance_m == d)[0]) for d in (0.18, 0.4, 2.45)]
+    others = [k for k in range(6) if k not in three]
+    held_out = errors(pairs, chosen=three, width=240, baseline=0.0225)
+    assert np.abs(held_out["pinhole fitted"][others]).max() < 0.02
+
+
+def test_figures_are_not_drawn_where_nothing_can_be_written(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table, figures = str(data / "thesis_table.csv"), tmp_path / "figures"
+    for words in (["--out", "/proc/c.toml", "--figures", str(figures)], ["--figures", "/proc/none/figures"]):
+        code, said, complaint = run(capsys, table, *words)
+        assert code == 2 and "cannot be written" in complaint and not said
+        assert not figures.exists()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

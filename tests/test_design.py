@@ -87,7 +87,7 @@ def test_a_head_can_be_given_without_any_file(capsys: pytest.CaptureFixture[str]
         (("--image", "3"), "try --image 1920x1080"),
         (("--wall", "4"), "try --wall 4x2.5@2"),
         (("--config", "none"), "presets"),
-        (("--out", "heads.txt"), "must be a .png"),
+        (("--out", "heads.txt"), "must end in .png; try heads.png"),
     ):
         code, _, said = run(capsys, *words)
         assert code == 2 and complaint in said and said.count("\n") == 1

@@ -16,10 +16,43 @@ def refuse_path(path: Path) -> None:
     """Raise ConfigError where no calibration can be written; before anything is measured or solved."""
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"--out {path}: a calibration must end in .toml; try {path.with_suffix('.toml')}")
+    refuse_file("--out", path)
+
+
+def refuse_file(option: str, path: Path | None, suffix: str = "") -> None:
+    """Raise ConfigError where `path` cannot be written, or does not end in `suffix` if one is asked for."""
+    if path is None:
+        return
+    if suffix and path.suffix.lower() != suffix:
+        raise ConfigError(f"{option} {path}: must end in {suffix}; try {path.with_suffix(suffix)}")
     if path.is_dir():
-        raise ConfigError(f"--out {path} is a folder; give the name of a file in it")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"--out {path}: there is no folder {path.absolute().parent}; make it first")
+        raise ConfigError(f"{option} {path} is a folder; give the name of a file in it")
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise ConfigError(f"{option} {path}: there is no folder {folder}; make it first")
+    _try_writing(f"{option} {path}", folder)
+
+
+def refuse_folder(option: str, folder: Path | None) -> None:
+    """Raise ConfigError where no files can be written into `folder`, which is made later if it is not there."""
+    if folder is None:
+        return
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{option} {folder} is a file; give a folder")
+    there = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    if not there.is_dir():
+        raise ConfigError(f"{option} {folder}: {there} is a file; give another folder")
+    _try_writing(f"{option} {folder}", there)
+
+
+def _try_writing(what: str, folder: Path) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"{what} cannot be written: {error.strerror or error}; choose a folder that can be written to"
+        ) from error
 
 
 def save_beside(calibration: Calibration, path: Path) -> Path | None:

@@ -234,16 +234,15 @@ def _run(
     solve: Callable[[BoardJob, Callable[[str], None]], Solved],
 ) -> None:
     """Collect, solve, say, write, draw."""
-    from scanmap.calibration.keeping import parts_lost, refuse_path
+    from scanmap.calibration.keeping import parts_lost, refuse_file, refuse_folder, refuse_path
     from scanmap.cli.terminal import say, stop_on_signal
-    from scanmap.errors import ConfigError
     from scanmap.session import board_report
     from scanmap.session import calibrating as session
 
-    refuse_path(out)
     figures, rrd = pictures
-    if figures is not None and figures.exists() and not figures.is_dir():
-        raise ConfigError(f"--figures {figures} is a file; give a folder")
+    refuse_path(out)
+    refuse_folder("--figures", figures)
+    refuse_file("--rrd", rrd, ".rrd")
     with stop_on_signal() as stop:
         job = _job(part, *what, stop)
         solved = solve(job, say)

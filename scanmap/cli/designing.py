@@ -50,13 +50,12 @@ def design(
     """
     import numpy as np
 
+    from scanmap.calibration.keeping import refuse_file
     from scanmap.cli.terminal import say
-    from scanmap.errors import ConfigError
     from scanmap.solvers.design import RANGES_M, evaluate
     from scanmap.solvers.design_figures import draw_designs
 
-    if out is not None and (out.suffix.lower() != ".png" or not out.absolute().parent.is_dir()):
-        raise ConfigError(f"--out {out}: must be a .png in a folder that is there")
+    refuse_file("--out", out, ".png")
     size = _size(image)
     short = {"baseline_m": None if baseline_mm is None else baseline_mm / 1e3, "beta_deg": beta_deg,
              "alpha_deg": alpha_deg}  # fmt: skip

@@ -21,15 +21,20 @@ if TYPE_CHECKING:
 def table(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE.csv", help="Header ppx,actual_m (or column, row; distance_mm, ...), a line each."),
+        typer.Argument(
+            metavar="FILE.csv",
+            help="Header ppx,actual_m (or column, row; distance_mm, ...), a line each; or calibrate.yml.",
+        ),
     ],
     width: Annotated[
-        int, typer.Option("--width", min=8, max=20000, help="Image along the axis the line moves on [px].")
-    ] = 1600,
-    height: Annotated[int, typer.Option("--height", min=8, max=20000, help="Image across that axis [px].")] = 1200,
+        int | None, typer.Option("--width", min=8, max=20000, help="Image along the axis the line moves on [px]; 1600.")
+    ] = None,
+    height: Annotated[
+        int | None, typer.Option("--height", min=8, max=20000, help="Image across that axis [px]; 1200.")
+    ] = None,
     baseline_mm: Annotated[
-        float, typer.Option("--baseline-mm", min=1.0, max=5000.0, help="Camera to laser, by ruler [mm].")
-    ] = 80.0,
+        float | None, typer.Option("--baseline-mm", min=1.0, max=5000.0, help="Camera to laser, by ruler [mm]; 80.")
+    ] = None,
     rows: Annotated[
         str | None, typer.Option("--rows", metavar="1:3|1,2,6", help="Fit these rows only; the others are predicted.")
     ] = None,
@@ -55,20 +60,22 @@ def table(
     import numpy as np
 
     from scanmap.calibration import Calibration
-    from scanmap.calibration.keeping import refuse_path
+    from scanmap.calibration.keeping import refuse_folder, refuse_path
     from scanmap.cli.terminal import say
-    from scanmap.errors import ConfigError
     from scanmap.solvers import table as solver
-    from scanmap.solvers.pairs import check_fit, read_pairs
+    from scanmap.solvers.pairs import NotedHead, check_fit, read_pairs
 
     if out is not None:
         refuse_path(out)
-    if figures is not None and figures.exists() and not figures.is_dir():
-        raise ConfigError(f"--figures {figures} is a file; give a folder")
+    refuse_folder("--figures", figures)
     base = Calibration.load(calibration) if calibration is not None else None
-    if base is not None:
-        width, height, baseline_mm = base.intrinsics.width, base.intrinsics.height, 1e3 * base.baseline_m
     pairs = read_pairs(file)
+    noted = pairs.head or NotedHead(1600, 1200, 0.08)
+    if base is not None:
+        noted = NotedHead(base.intrinsics.width, base.intrinsics.height, base.baseline_m)
+        width = height = baseline_mm = None
+    width, height = width or noted.width, height or noted.height
+    baseline_mm = baseline_mm or 1e3 * noted.baseline_m
     other = read_pairs(experiment) if experiment is not None else None
     if not pairs.has_columns and pairs.published and out is None and rows is None:
         _print_experiment(pairs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,6 +28,7 @@ GOLDEN = 0.618033988749895  # multiples of it fill a period evenly
 CONTRAST_DN = 12.0  # [grey levels] a pixel belongs to the line if the laser adds this to it
 LEAST_LIT = 30  # pixels
 ROWS = 240  # of an image are enough
+LINE_EVERY_S = 5.0  # so much silence at most
 
 Progress = Callable[[str], None]
 
@@ -100,9 +102,13 @@ def latency_by_sweeps(
             "mode": "continuous", "passes": 2, "speed_deg_s": speed, "step_deg": 0.01, "off_frames": False,
         }  # fmt: skip
         bearings, columns = [], []
+        spoken = time.monotonic()
         for shot in sweep(opened.rig, SweepParams(**plan), sleep=opened.sleep, clock=opened.clock):
             bearings.append(shot.bearing)
             columns.append(process(shot).line.column_px[::every])
+            if time.monotonic() - spoken > LINE_EVERY_S:
+                spoken = time.monotonic()
+                progress(f"at {math.degrees(shot.bearing):.0f} deg, {len(bearings)} pictures")
         passes.append((math.radians(speed), *_two_passes(np.array(bearings), np.array(columns))))
     return latency_of_sweeps(passes)
 
@@ -125,7 +131,11 @@ def latency_by_blinks(opened: OpenRig, progress: Progress, blinks: int = BLINKS)
         progress(f"blinking the laser {blinks} times")
         period_s = _period(rig.camera)
         seen = []
+        spoken = time.monotonic()
         for number in range(2 * blinks):
+            if time.monotonic() - spoken > LINE_EVERY_S:
+                spoken = time.monotonic()
+                progress(f"blink {number // 2} of {blinks}")
             phase_s = period_s * ((number * GOLDEN) % 1.0)
             seen.append(_blink(opened, rig.camera, contrast, phase_s, on=number % 2 == 0))
         return latency_of_blinks(seen), contrast

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,14 @@ SECOND_NAMES = ("published_alg2", "alg2", "algorithm_2", "algorithm2")
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
+class NotedHead(NamedTuple):
+    """What a file of pairs says of the head."""
+
+    width: int  # [px] of the image along the axis the line moves on
+    height: int  # [px] across it
+    baseline_m: float
+
+
 @dataclass(frozen=True)
 class Pairs:
     """N measurements; NaN where a cell of the csv is empty."""
@@ -31,6 +40,7 @@ class Pairs:
     distance_m: Array  # (N,) measured with a ruler
     published_ratio_m: Array  # (N,) what was published for Algorithm 1
     published_angle_m: Array  # (N,) and for Algorithm 2
+    head: NotedHead | None = None  # where the file says what it was measured with
 
     @property
     def has_columns(self) -> bool:
@@ -44,13 +54,18 @@ class Pairs:
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Read a csv of measurements: a header, then a line each; `,`, `;` or tab between, `#` begins a comment.
+    """Read measurements: a csv, or the calibrate.yml of laser-range-finder (`scanmap.solvers.range_finder`).
 
-    Needs a distance (`actual_m`, `distance_mm`, ...) and, for a fit, a column (`ppx`, `column`, `row`, ...).
+    A csv has a header, then a line each; `,`, `;` or tab between, `#` begins a comment. Needs a distance (`actual_m`,
+    `distance_mm`, ...) and, for a fit, a column (`ppx`, `column`, `row`, ...).
 
     Raises:
         ConfigError: no such file, no header, a column is missing, or a cell is no number; with its line.
     """
+    if path.suffix.lower() in (".yml", ".yaml"):
+        from scanmap.solvers.range_finder import read_range_finder
+
+        return read_range_finder(path)
     lines = _lines(path)
     if not lines:
         raise ConfigError(f"{path} is empty; it needs a header such as ppx,actual_m and a line for every measurement")
@@ -62,23 +77,32 @@ def read_pairs(path: Path) -> Pairs:
             f"{path}, line {lines[0][0]}: no column of distances in the header {shorten(', '.join(header), 120)}; "
             f"valid: {', '.join(DISTANCE_NAMES)}, with _m, _cm or _mm behind"
         )
-    found = {
-        "column": _find(header, COLUMN_NAMES),
-        "distance_m": distance,
-        "published_ratio_m": _find(header, FIRST_NAMES, units=True),
-        "published_angle_m": _find(header, SECOND_NAMES, units=True),
-    }
+    places = (
+        _find(header, COLUMN_NAMES), distance,
+        _find(header, FIRST_NAMES, units=True), _find(header, SECOND_NAMES, units=True),
+    )  # fmt: skip
     rows = [_numbers(path, number, text, separator, len(header)) for number, text in lines[1:]]
     if not rows:
         raise ConfigError(f"{path} has a header and no measurement under it")
     cells = np.array(rows)
     empty = np.full(len(rows), np.nan)
-    pairs = Pairs(**{name: empty if at is None else cells[:, at[0]] * at[1] for name, at in found.items()})
+    column, actual, first, second = (empty if at is None else cells[:, at[0]] * at[1] for at in places)
+    pairs = Pairs(column, actual, first, second)
     wrong = ~(pairs.distance_m > 0)
     if wrong.any():
         number = lines[1 + int(wrong.argmax())][0]
         raise ConfigError(f"{path}, line {number}: distance {pairs.distance_m[wrong][0]:g}; it must be above 0")
     return pairs
+
+
+def once_each(column: Array, distance: Array) -> tuple[Array, Array]:
+    """The pairs (M,), (M,) without those that were noted twice.
+
+    The same column at the same distance again is no second measurement: it is rounded to the same pixel.
+    """
+    both = np.stack([column, distance], axis=1)
+    first = np.sort(np.unique(both, axis=0, return_index=True)[1])
+    return column[first], distance[first]
 
 
 def check_fit(pairs: Pairs, path: Path, width: int, chosen: NDArray[np.intp]) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration, CalibrationFile, PixelAngleModel, RatioModel
 from scanmap.errors import CalibrationError
-from scanmap.solvers.pairs import Pairs
+from scanmap.solvers.pairs import Pairs, once_each
 from scanmap.triangulation import pixel_angle_depth, ratio_depth
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def fit_table(pairs: Pairs, width: int, baseline_m: float, chosen: NDArray[np.in
     Raises:
         CalibrationError: the distances do not fall or rise with the column: no head measures that.
     """
-    column, distance = pairs.column[chosen], pairs.distance_m[chosen]
+    column, distance = once_each(pairs.column[chosen], pairs.distance_m[chosen])
     trend = float(np.corrcoef(column, 1.0 / distance)[0, 1])
     if abs(trend) < 0.8:
         raise CalibrationError(

@@ -14,6 +14,7 @@ from scanmap.solvers.table import (
     PUBLISHED_RATIO,
     TableFit,
     columns_rightward,
+    depths_of,
     fit_angle,
     fit_ratio,
 )
@@ -63,6 +64,10 @@ def fit_lines(pairs: Pairs, fit: TableFit, chosen: NDArray[np.intp]) -> list[str
         f"taken: {chose}, which predicts a row that is left out better; worst row "
         f"{worst_percent(pairs, fit, chosen):.1f} %, infinity at column {fit.best.infinity():.1f}"
     )
+    by_model = worst_by_model(pairs, fit, chosen)
+    best = min(by_model, key=lambda name: by_model[name])
+    worst = ", ".join(f"{name} {percent:.1f} %" for name, percent in by_model.items())
+    lines.append(f"worst row by model: {worst}; best: {best}")
     if fit.infinity_slack > 10.0:
         lines.append(
             f"at the farthest row one pixel is {fit.infinity_slack:.0f} % of the distance: whole columns are too "
@@ -75,6 +80,20 @@ def worst_percent(pairs: Pairs, fit: TableFit, chosen: NDArray[np.intp]) -> floa
     """Largest relative error of the pinhole head on the rows it was fitted to [%]."""
     u = columns_rightward(pairs.column, fit.width, fit.mirrored)[chosen]
     return float(100.0 * np.abs(fit.best.depth(u) / pairs.distance_m[chosen] - 1.0).max())
+
+
+def worst_by_model(pairs: Pairs, fit: TableFit, chosen: NDArray[np.intp]) -> dict[str, float]:
+    """Largest relative error of each fitted model on the rows it was fitted to [%]."""
+    names = {"ratio fitted": "Algorithm 1", "pixel_angle fitted": "Algorithm 2 (line)",
+             "pixel_angle by distance": "Algorithm 2 by distance", "pinhole fitted": "pinhole",
+             "pinhole with x fitted": "pinhole with x fitted"}  # fmt: skip
+    depths = depths_of(fit, pairs)
+    off = {
+        words: 100.0 * np.abs(depths[name][chosen] / pairs.distance_m[chosen] - 1.0)
+        for name, words in names.items()
+        if name in depths
+    }
+    return {words: float(each.max()) for words, each in off.items() if np.isfinite(each).all()}
 
 
 def check_worth(pairs: Pairs, fit: TableFit, chosen: NDArray[np.intp]) -> None:
