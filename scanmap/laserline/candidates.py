@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -187,7 +186,7 @@ def runs_in(response: U16, length: int) -> U16:
     """
     (blocks, width), (row, step) = response.shape, response.strides
     length = min(length, width)
-    return as_strided(response, (blocks, width - length + 1, length), (row, step, step))
+    return np.ndarray((blocks, width - length + 1, length), response.dtype, response, 0, (row, step, step))
 
 
 def _apart(column: F32, value: F32) -> Candidates:

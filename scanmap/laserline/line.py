@@ -191,16 +191,17 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         dim = (reason == Reason.WEAK) & (peaks.height >= params.min_peak) & (peaks.sigma_px < _DIM_PX)
         if dim.any():
             reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, reason == Reason.OK, dim)] = Reason.OK
-        if params.method == "gauss":
+        good = reason == Reason.OK
+        if params.method == "gauss" and not (good.all() and not peaks.clipped.any()):
             # A wide saturated line whose flanks are no Gaussian's stands in a halo.
             misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
             halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & ~even
-            reason[halo & (reason == Reason.OK)] = Reason.WIDE
+            reason[halo & good] = Reason.WIDE
             final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
             lost = (reason != Reason.OK) & ~final
-            _take_cores(line, (r[lost], c[lost]), y.T[lost], params.max_width_px, noise, params)
-        good = reason == Reason.OK
-        k = np.flatnonzero(good)
+            _take_cores(line, (r[lost], c[lost]), y[:, lost].T, params.max_width_px, noise, params)
+            good = reason == Reason.OK
+        k = good.nonzero()[0]
         at_good = r[k]
         line.column_px[at_good], line.peak[at_good] = c[k] + offset[k], peaks.height[k]
         line.width_px[at_good] = peaks.width_px[k]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +46,14 @@ def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
     Dynamic programming over the candidates: the path with the largest sum of log(score / min_snr), where
     going on along a line is free and jumping to another costs. Where no block has a rival the best is taken.
     """
+    if score.shape[1] == 1:
+        # What the general case gives where no block has a rival.
+        return np.where(score[:, 0] > min_snr, candidates.column[:, 0], np.float32(np.nan))
     order = np.argsort(-score, axis=1, kind="stable")[:, :_STATES]
     column = np.take_along_axis(candidates.column, order, 1)
     gain = np.log(np.maximum(np.take_along_axis(score, order, 1), 1e-3) / min_snr)
     chosen = np.where(gain[:, 0] > 0, column[:, 0], np.nan).astype(np.float32)
-    contested = np.flatnonzero((gain[:, 1:2] > 0).any(axis=1))
+    contested = (gain[:, 1] > 0).nonzero()[0]
     if not contested.size:
         return chosen
     # Stretches between blocks that nothing contests are decided on their own.
@@ -66,16 +71,15 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
     A row looks around the column its block's path has there, interpolated along the line; near a jump it looks
     at the neighbours' columns too and takes where the line stands out most.
     """
-    row = np.arange(len(plane))
-    block = row // BLOCK
-    step = np.diff(path)
+    row, block, place = _rows_of_blocks(len(plane))
+    step = path[1:] - path[:-1]
     smooth = np.abs(step) <= CONNECTED_PX
     slope = np.zeros(len(path), np.float32)
     slope[1:-1] = np.where(smooth[1:] & smooth[:-1], 0.5 * (step[1:] + step[:-1]), 0.0) / BLOCK
-    own = path[block] + slope[block] * (row % BLOCK - np.float32(0.5 * (BLOCK - 1)))
+    own = path[block] + slope[block] * place
     best, height_of_best = stand_out(plane, row, own, noise)
     jumpy = ~np.concatenate([[True], smooth, [True]])
-    at = np.flatnonzero((jumpy[1:] | jumpy[:-1])[block])
+    at = (jumpy[1:] | jumpy[:-1])[block].nonzero()[0]
     if at.size:
         padded = np.concatenate([[np.nan], path, [np.nan]])
         beside = np.concatenate([padded[:-2][block[at]], padded[2:][block[at]]])
@@ -83,8 +87,15 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
         for rival, response in zip(np.split(rivals, 2), np.split(responses, 2), strict=True):
             better = response > height_of_best[at] * 1.05
             best[at[better]], height_of_best[at[better]] = rival[better], response[better]
-    found = np.flatnonzero((height_of_best > 0) & np.isfinite(window[:, 0]))
+    found = ((height_of_best > 0) & np.isfinite(window[:, 0])).nonzero()[0]
     return found, best[found]
+
+
+@cache
+def _rows_of_blocks(rows: int) -> tuple[Index, Index, NDArray[np.float64]]:
+    """All rows (H,) of a picture, the block each lies in, and how far below that block's middle it is."""
+    row = np.arange(rows)
+    return row, row // BLOCK, row % BLOCK - 0.5 * (BLOCK - 1)
 
 
 def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:

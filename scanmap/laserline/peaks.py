@@ -70,7 +70,7 @@ def fit_gaussian(
     """
     n = len(y)
     x = (np.arange(n, dtype=np.float32) - n // 2)[:, None]
-    cut = np.flatnonzero(usable.min(axis=0) < 1)  # rows with samples that say little
+    cut = (usable.min(axis=0) < 1).nonzero()[0]  # rows with samples that say little
     clipped = np.zeros(y.shape[1], bool)
     clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
     y, low, high = levelled(y, x, sample_noise)
@@ -81,7 +81,7 @@ def fit_gaussian(
         fit = _improve_whole(x, _Look(y, x, fit), fit)
     odd = (np.abs(fit.u) > _OFF_MOST) | (fit.s < _NARROW_PX) | (fit.s > n / _WIDEST) | (_DIM * sample_noise > fit.A)
     odd[slice(None) if mostly_cut else cut] = True
-    part = np.flatnonzero(odd)
+    part = odd.nonzero()[0]
     # What is left of a clipped line needs more of its background to be told four parameters from.
     least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
     if len(part) <= _STRAY * len(odd) and not cut.size:

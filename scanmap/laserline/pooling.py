@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -40,10 +39,10 @@ def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] |
     for rows in (support, 5):
         if rows > support or rows > len(column):
             continue
-        at = np.flatnonzero(pending & (stop - start >= rows))
+        at = (pending & (stop - start >= rows)).nonzero()[0]
         if not at.size:
             continue
-        first = np.clip(at - rows // 2, start[at], stop[at] - rows)
+        first = np.minimum(np.maximum(at - rows // 2, start[at]), stop[at] - rows)
         fitted, spread, chi2 = _quadratic(column, sigma, at, first, rows)
         good = chi2 < _MISFIT
         good_at = at[good]
@@ -71,7 +70,7 @@ def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
         span = 4 * lag
         if len(column) <= span:
             return 1.0
-        at = np.flatnonzero((start[:-span] == start[span:]) & np.isfinite(column[:-span]))[::2]
+        at = ((start[:-span] == start[span:]) & np.isfinite(column[:-span])).nonzero()[0][::2]
         if len(at) < TELLING:
             return 1.0
         rows = len(column) - span
@@ -82,7 +81,7 @@ def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
         middle = len(ratio) // 2
         ratio.partition(middle)
         squares.append(float(ratio[middle]) / 0.455)  # the median of chi^2 with one degree of freedom
-    return float(np.sqrt(np.mean(squares)))
+    return float(np.sqrt(sum(squares) / len(squares)))
 
 
 def segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -96,10 +95,11 @@ def segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.
     off[2:] = bend
     np.fmin(off[:-2], bend, out=off[:-2])
     off = np.where(np.isnan(off), size, off)
-    limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.hypot(sigma[1:], sigma[:-1]))
+    variance = sigma * sigma
+    limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.sqrt(variance[1:] + variance[:-1]))
     edge = np.ones(rows + 1, bool)
     edge[1:-1] = ~(off <= limit) | (size > 8.0)
-    begins = np.flatnonzero(edge)
+    begins = edge.nonzero()[0]
     number = np.cumsum(edge[:-1]) - 1
     return begins[number], begins[number + 1]
 
@@ -173,4 +173,4 @@ def _powers(rows: int) -> Array:
 def _windows(values: Array, rows: int) -> Array:
     """All windows of so many values (rows, H - rows + 1), a view."""
     step = values.strides[0]
-    return as_strided(values, (rows, len(values) - rows + 1), (step, step), writeable=False)
+    return np.ndarray((rows, len(values) - rows + 1), values.dtype, values, 0, (step, step))

@@ -28,7 +28,7 @@ def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask) -> In
         column, sigma: (N,) [px].
         good, dim: (N,) rows found, and rows in question.
     """
-    found, asked = np.flatnonzero(good), np.flatnonzero(dim)
+    found, asked = good.nonzero()[0], dim.nonzero()[0]
     after = np.searchsorted(found, asked)
     inside = (after > 0) & (after < len(found))
     asked, before, after = asked[inside], found[after[inside] - 1], found[np.minimum(after[inside], len(found) - 1)]
@@ -61,7 +61,7 @@ def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) 
     with np.errstate(invalid="ignore"):
         if not (width > NO_BLOB_PX).any():
             return mask
-    found = np.flatnonzero(np.isfinite(column))
+    found = np.isfinite(column).nonzero()[0]
     # Known as well as the noise allows, or simply well.
     bound = 1.062 * np.sqrt(width[found]) * max(noise, 1.0) / peak[found]
     known = np.minimum(np.maximum(1.3 * bound, _CERTAIN * width[found]), _POSSIBLE * width[found])
@@ -96,15 +96,16 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
     two above and two below.
     """
     mask = np.zeros(len(column), bool)
-    found = np.flatnonzero(np.isfinite(column))
+    found = np.isfinite(column).nonzero()[0]
     if len(found) < _INNER:
         return mask
-    broken = (np.diff(found) > 1) | ~(np.abs(np.diff(column[found])) < 3.0)
-    edges = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(found)]])
-    long = np.diff(edges) >= _INNER
+    at = column[found]
+    broken = (found[1:] - found[:-1] > 1) | ~(np.abs(at[1:] - at[:-1]) < 3.0)
+    edges = np.concatenate([[0], broken.nonzero()[0] + 1, [len(found)]])
+    long = edges[1:] - edges[:-1] >= _INNER
     for end, inward in ((edges[:-1][long], 1), (edges[1:][long] - 1, -1)):
         inner = found[end[:, None] + inward * np.arange(3, 6)]
-        usual, bright = width[inner].mean(axis=1), peak[inner].mean(axis=1)
+        usual, bright = width[inner].sum(axis=1) / 3.0, peak[inner].sum(axis=1) / 3.0
         for k in range(2):
             row = found[end + inward * k]
             odd = np.abs(width[row] - usual) > 0.3 * usual + 2.0 * sigma[row]
@@ -123,7 +124,7 @@ def crumbs(column: Array, weak: Mask, least: int = 12) -> Mask:
     Of 3 rows always, and of fewer than `least` if most are `weak` (H,).
     """
     mask = np.zeros(len(column), bool)
-    found = np.flatnonzero(np.isfinite(column))
+    found = np.isfinite(column).nonzero()[0]
     if not found.size:
         return mask
     number = numbered(found, column[found], _GAP_ROWS + 1)

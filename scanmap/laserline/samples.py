@@ -97,7 +97,7 @@ def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: float) -> F32
     mixed = own * np.float32(share)
     mixed += beside * np.float32(1.0 - share)
     mixed *= np.float32(1.0 / (share + (1.0 - share) * _LIGHT))
-    cut = np.flatnonzero(~usable.all(axis=0))
+    cut = (~usable.all(axis=0)).nonzero()[0]
     mixed[:, cut] = own[:, cut]
     return mixed
 
@@ -122,7 +122,7 @@ def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
     few = wide < _FEW and full.max() > _WINDOWS[1][1]
     found, lower = [], -2
     for half, upper in (_WINDOWS[0], _WINDOWS[-1]) if few else _WINDOWS:
-        rows = np.flatnonzero((full > lower) & (full <= upper))
+        rows = ((full > lower) & (full <= upper)).nonzero()[0]
         lower = upper
         if rows.size:
             found.append((half, rows))
@@ -140,7 +140,7 @@ def levelled(y: F32, x: F32, sample_noise: float) -> tuple[F32, F32, F32]:
     low, top = np.minimum(left, right), y.max(axis=0)
     height = top - np.maximum(left, right)
     least = np.float32(4.5 * sample_noise * np.sqrt(2.0 / _end(y)))
-    steep = np.flatnonzero(np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height))
+    steep = (np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height)).nonzero()[0]
     if steep.size:
         even = y[:, steep] - ramp[steep] * (x / np.float32(len(x) - _end(y)))
         y[:, steep] = even

@@ -51,7 +51,7 @@ def search(sight: Sight, window: F64, min_snr: float) -> Course:
         return Course(path, np.zeros(len(path), bool))
     found, shares = _settled(sight, window, min_snr)
     good = found.snr[:, 0] > 0
-    rest = np.flatnonzero(~good)
+    rest = (~good).nonzero()[0]
     if not rest.size:
         return Course(choose_path(found, found.snr, min_snr), good)
     found = _with_blocks(found, rest, _all_candidates(sight, rest, window, min_snr))
@@ -74,9 +74,8 @@ def _settled(sight: Sight, window: F64, min_snr: float) -> tuple[Candidates, F32
     column[::2], height[::2], shares[::2] = leads.column, np.where(good, leads.height, np.float32(0.0)), known
     between = len(column[1::2])
     after = np.minimum(np.arange(1, between + 1), len(good) - 1)
-    both = np.flatnonzero(
-        good[:between] & good[after] & (np.abs(leads.column[:between] - leads.column[after]) < STEEP_PX)
-    )
+    near = np.abs(leads.column[:between] - leads.column[after]) < STEEP_PX
+    both = (good[:between] & good[after] & near).nonzero()[0]
     middle = 0.5 * (leads.column[both] + leads.column[after[both]])
     at, response = stand_out(sight.lit, np.minimum((2 * both + 1) * BLOCK + 1, len(sight.lit) - 1), middle, sight.noise)
     least = np.minimum(leads.height[both], leads.height[after[both]])
