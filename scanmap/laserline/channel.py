@@ -29,8 +29,10 @@ def laser_channel(image: U8) -> int:
     return judged_channel(image)[0]
 
 
-def judged_channel(image: U8) -> tuple[int, bool]:
+def judged_channel(image: U8, background: U8 | None = None) -> tuple[int, bool]:
     """The laser's channel (0 blue, 1 green, 2 red) in a BGR image, and whether there is no doubt about it.
+
+    With a `background`, of the same view with the laser off, in what that lacks.
 
     Measured on some pairs of rows: how far the best place rises above both its sides in the channel and in the
     channel's lead over each of the other two, whichever is least, and in both rows; the better half of the pairs
@@ -41,9 +43,9 @@ def judged_channel(image: U8) -> tuple[int, bool]:
     """
     for pairs in _COLOUR_PAIRS:
         step = max(1, len(image) // pairs)
-        below = image[min(2, len(image) - 1) :: step]
+        above, below = (_every(step, first, image, background) for first in (0, min(2, len(image) - 1)))
         n = len(below)
-        planes = _planes(np.concatenate([image[::step][:n], below]))
+        planes = _planes(np.concatenate([above[:n], below]))
         rows = [plane[:n] for plane in planes]
         blazing = _blazing_channel(rows)
         if blazing is not None:
@@ -65,6 +67,12 @@ def judged_channel(image: U8) -> tuple[int, bool]:
     else:
         strength = [rare * chain for rare, chain in zip(_USUAL, _chains(both.reshape(3, n, -1), step), strict=True)]
     return int(np.argmax(strength)), False
+
+
+def _every(step: int, first: int, image: U8, background: U8 | None) -> U8:
+    """Some rows (n, W, 3) of a picture, less those of the background."""
+    rows = image[first::step]
+    return rows if background is None else np.asarray(cv2.subtract(rows, background[first::step]), np.uint8)
 
 
 def _chains(rising: U8, step: int) -> list[float]:

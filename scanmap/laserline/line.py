@@ -17,7 +17,7 @@ from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
 from scanmap.laserline.flat import flat_tops
-from scanmap.laserline.grey import Grey, exposure_gain, to_grey
+from scanmap.laserline.grey import Grey, to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
@@ -142,8 +142,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
-        gain = exposure_gain(sight.on, sight.off)
-        height, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, gain)
+        height, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
         line = without(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
         # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
         disturbed = with_ripple < _STANDS_OUT[1]

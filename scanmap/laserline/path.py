@@ -92,10 +92,10 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
 
 
 @cache
-def _rows_of_blocks(rows: int) -> tuple[Index, Index, NDArray[np.float64]]:
+def _rows_of_blocks(rows: int) -> tuple[Index, Index, F32]:
     """All rows (H,) of a picture, the block each lies in, and how far below that block's middle it is."""
     row = np.arange(rows)
-    return row, row // BLOCK, row % BLOCK - 0.5 * (BLOCK - 1)
+    return row, row // BLOCK, (row % BLOCK - 0.5 * (BLOCK - 1)).astype(np.float32)
 
 
 def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:

@@ -97,7 +97,7 @@ def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: float) -> F32
     mixed = own * np.float32(share)
     mixed += beside * np.float32(1.0 - share)
     mixed *= np.float32(1.0 / (share + (1.0 - share) * _LIGHT))
-    cut = (~usable.all(axis=0)).nonzero()[0]
+    cut = (usable.min(axis=0) < 1).nonzero()[0]
     mixed[:, cut] = own[:, cut]
     return mixed
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, is_large, noise_of
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
-from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, exposure_gain, extract, to_grey, without_background
 
 U8 = NDArray[np.uint8]
 
@@ -41,6 +41,7 @@ class Sight(NamedTuple):
     channel: int  # of the image; -1 without one
     noise: float  # of a sample of lit [grey levels]
     colour: float = 1.0  # how finely it is stored: 0 where the channels' noise is one, 1 where they are independent
+    gain: float = 1.0  # that the laser-off frame's exposure is matched by
 
 
 def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
@@ -57,12 +58,13 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
         plane = image[..., channel] if is_large(image) else extract(image, channel)
         return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows), _fineness(image, channel))
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
-    off = None
+    off, gain = None, 1.0
     if background is not None:
         off = to_grey(background, how.grey, how.bit_index, channel)
-        lit, plane = without_background(on, off, how.off_threshold), np.asarray(cv2.max(on, off), np.uint8)
+        gain = exposure_gain(on, off)
+        lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
     rows = np.ascontiguousarray(quick_rows(lit))
-    return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows))
+    return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows), gain=gain)
 
 
 def channel_of(image: U8, background: U8 | None, grey: Grey) -> tuple[int | None, bool]:
@@ -71,7 +73,7 @@ def channel_of(image: U8, background: U8 | None, grey: Grey) -> tuple[int | None
     None for a conversion that mixes the channels.
     """
     if grey == "auto":
-        return judged_channel(image if background is None else np.asarray(cv2.subtract(image, background), np.uint8))
+        return judged_channel(image, background)
     return CHANNEL.get(grey), False
 
 
