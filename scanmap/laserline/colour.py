@@ -25,6 +25,8 @@ _STRANGER = 0.62
 _UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
 _MOSTLY = 0.75  # share of a run's rows
 _PURE = 0.45  # height in other channels of a line whose flanks must show its colour
+# A place's share may exceed the laser's by so much, and even where that makes it nearly white by the less.
+_BLEEDS, _WHITISH = (0.4, 0.15), 0.8
 # By how much the laser's channel leads beside a saturated core, as a share of all light there and of the core's own:
 # white by the less, coloured by the more.
 _NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
@@ -104,9 +106,10 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     share[block[broad], which[broad]] = coarse.other / coarse.own
     laser = _laser_share(candidates, share, shares)
     factor = _of_laser(near_by, laser, noise)
-    # A line on a wide thing counts for what it rises by itself.
+    # A line on a wide thing counts for what it rises by itself; and what is wide must rise on its scale.
     part = np.minimum(near_by.own[broad] / response[broad], 1.0)
-    factor[broad] = np.maximum(part * factor[broad], _of_laser(coarse, laser, noise))
+    wide = np.where(coarse.own > near_by.own[broad], _of_laser(coarse, laser, noise), 0.0)
+    factor[broad] = np.maximum(part * factor[broad], wide)
     doubt[block, which] = factor
     return doubt
 
@@ -133,7 +136,8 @@ def _of_laser(seen: _Colours, laser: float | None, noise: float) -> F32:
     if laser is None or laser > _COLOURLESS_SHARE:
         return np.asarray(np.where(seen.saturated, coloured, 1.0), np.float32)
     # Chroma is stored at half the columns by most cameras: the line's colour bleeds, its share by half that again.
-    excess = seen.other - (max(laser, 0.0) + 0.4) * seen.own
+    limit = max(min(max(laser, 0.0) + _BLEEDS[0], _WHITISH), laser + _BLEEDS[1])
+    excess = seen.other - limit * seen.own
     uncertain = 3.0 * noise / np.sqrt(2.0 * BLOCK)
     factor = np.clip(1.0 - (excess - uncertain) / np.maximum(uncertain, 0.2 * seen.own), 0.0, 1.0)
     # Where a laser of pure colour saturates white, what is beside the core still has the colour.
@@ -281,17 +285,18 @@ def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
         the share of all the light there, and that of the light above the samples' ends; 1 where no flank is seen.
     """
     own, others, half = y[:, channel], (channel - 1, channel - 2), len(y) // 2
-    rise = np.where(y.max(axis=1) < COLOURLESS, own - own[[0, 1, -2, -1]].min(axis=0), 0.0)
-    index = np.arange(y.shape[2])
-    left, right = rise[2:half].argmax(axis=0) + 2, rise[half:-2].argmax(axis=0) + half
-    hidden = np.minimum(rise[left, index], rise[right, index]) < _FLANK
+    # Where one of the others is cut, the other tells.
+    clear = np.maximum(own, np.minimum(y[:, others[0]], y[:, others[1]])) < COLOURLESS
+    index, sides = np.arange(y.shape[2]), (slice(0, half), slice(half, None))
+    rises = [np.where(clear[side], own[side] - own[side].min(axis=0), 0.0) for side in sides]
+    left, right = rises[0].argmax(axis=0), rises[1].argmax(axis=0) + half
+    hidden = np.minimum(rises[0].max(axis=0), rises[1].max(axis=0)) < _FLANK
     light = y[left, :, index] + y[right, :, index]
     near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
     # All of either side, for colour is smeared.
     total = np.zeros((3, y.shape[2]), np.float32)
     for side, ends in ((slice(2, half), [0, 1]), (slice(half, -2), [-2, -1])):
-        clear = y[side].max(axis=1, keepdims=True) < COLOURLESS
-        total += np.where(clear, y[side] - y[ends].mean(axis=0), 0.0).sum(axis=0)
+        total += np.where(clear[side, None], y[side] - y[ends].mean(axis=0), 0.0).sum(axis=0)
     beyond = np.clip(1.0 - total[list(others)].max(axis=0) / np.maximum(total[channel], 1.0), 0.0, 1.0)
     beyond[total[channel] < _FLANK] = 0.0
     return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
