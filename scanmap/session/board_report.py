@@ -49,7 +49,12 @@ def axis_words(solved: Solved) -> list[str]:
     known = uncertainty_of(solved.calibration)
     sigma = [known.sigma(name) if known else 0.0 for name in SOLVED]
     (x, y, _), (tilt_x, tilt_y) = fit.mount.offset_m, fit.mount.tilt_deg
+    doubt = (
+        "warning: the turn seen in the pictures contradicts the camera's calibration by more than its uncertainty: "
+        "did the focus change, or are the stage's steps per degree a little off?"
+    )
     return [
+        *([] if fit.agrees else [doubt]),
         f"{len(fit.views)} views over {fit.span_deg:.1f} deg, rms {fit.rms_px:.3f} px; the head turns "
         f"{fit.turn:.4f} deg "
         "for every degree of its bearing",

@@ -14,6 +14,7 @@ from scanmap.calibration.gates import GATES
 from scanmap.calibration.uncertainty import INTRINSICS
 from scanmap.errors import CalibrationError
 from scanmap.geometry import HeadMount, inverse, rigid, rotation_z
+from scanmap.solvers.axis_joint import joint_step
 from scanmap.solvers.board import Board
 from scanmap.solvers.board_pose import board_pose, project
 from scanmap.solvers.detection import Rejected, View
@@ -44,6 +45,7 @@ class AxisFit(NamedTuple):
     rejected: list[Rejected]
     span_deg: float  # bearings the board was seen over
     turn: float  # turn seen in the pictures over turn of the bearings: 1 for a stage that does what it says
+    agrees: bool = True  # whether the turn wants a camera that the calibration's own uncertainty allows
 
     @property
     def rms_px(self) -> float:
@@ -90,11 +92,7 @@ def calibrate_axis(views: Sequence[View], board: Board, calibration: Calibration
                 "the head turns, and the bearings must be those of the pictures"
             )
         _require(good)
-    fit = AxisFit(
-        _mount(solved.x, calibration), solved.covariance, _slope_by_intrinsics(good, board, calibration, solved),
-        good, solved.residuals, rejected, _span_deg(good), turn,
-    )  # fmt: skip
-    return _checked(fit, calibration)
+    return _checked(_with_camera(solved, good, board, calibration, (rejected, turn)), calibration)
 
 
 def with_axis(calibration: Calibration, fit: AxisFit) -> Calibration:
@@ -262,19 +260,38 @@ def _solve(views: Sequence[View], board: Board, calibration: Calibration, start:
     return _Solved(found.x, _residuals(found.x, views, board, calibration), covariance[:4, :4], J)
 
 
-def _slope_by_intrinsics(views: Sequence[View], board: Board, calibration: Calibration, solved: _Solved) -> Array:
-    """Derivative (4, 9) of SOLVED by the intrinsics. Source: implicit function theorem at the least squares minimum."""
+def _with_camera(
+    solved: _Solved, views: list[View], board: Board, calibration: Calibration, rest: tuple[list[Rejected], float]
+) -> AxisFit:
+    """The fit, its camera no surer than its calibration says: see `joint_step`."""
+    change = _by_intrinsics(views, board, calibration, solved.x)
+    joint = joint_step(np.concatenate([r.ravel() for r in solved.residuals]), solved.jacobian, change, calibration)
+    rejected, turn = rest
+    if joint is None or not joint.agrees:
+        # Source: implicit function theorem at the least squares minimum.
+        slope: Array = np.asarray(-np.linalg.lstsq(solved.jacobian, change, rcond=None)[0][:4], np.float64)
+        own, x, residuals = solved.covariance, solved.x, solved.residuals
+    else:
+        own, x, slope = joint.own, solved.x + joint.step, joint.slope
+        residuals = _residuals(x, views, board, moved(calibration, INTRINSICS, joint.camera))
+    return AxisFit(
+        _mount(x, calibration), own, slope, views, residuals, rejected, _span_deg(views), turn,
+        joint is None or joint.agrees,
+    )  # fmt: skip
+
+
+def _by_intrinsics(views: Sequence[View], board: Board, calibration: Calibration, x: Array) -> Array:
+    """Derivative (R, 9) of all residuals by the intrinsics."""
     own = calibration.intrinsics
     steps = [1e-3 * own.fx, 1e-3 * own.fy, 1e-3 * own.fx, 1e-3 * own.fx, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2]
-    change = np.zeros((len(solved.jacobian), 9))
-    for k, (name, step) in enumerate(zip(INTRINSICS, steps, strict=True)):
+    columns = []
+    for name, step in zip(INTRINSICS, steps, strict=True):
         both = [
-            np.concatenate([r.ravel() for r in _residuals(solved.x, views, board, moved(calibration, [name], by))])
+            np.concatenate([r.ravel() for r in _residuals(x, views, board, moved(calibration, [name], by))])
             for by in (np.array([-step]), np.array([step]))
         ]
-        change[:, k] = (both[1] - both[0]) / (2.0 * step)
-    slope: Array = np.asarray(-np.linalg.lstsq(solved.jacobian, change, rcond=None)[0][:4], np.float64)
-    return slope
+        columns.append((both[1] - both[0]) / (2.0 * step))
+    return np.stack(columns, axis=1)
 
 
 def _checked(fit: AxisFit, calibration: Calibration) -> AxisFit:
