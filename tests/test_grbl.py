@@ -7,6 +7,7 @@ import itertools
 import math
 import os
 import random
+import re
 import subprocess
 import sys
 import threading
@@ -132,6 +133,86 @@ def test_a_second_start_finds_a_board_that_a_killed_one_left_shining(url: str, b
     with_laser.close()
     if board.dialect == "grbl":
         assert board.memory.settings[1] == 25  # not the 255 of the killed run
+
+
+def test_startup_lines_that_light_the_laser_are_undone(url: str, board: Firmware) -> None:
+    board.memory.startup[0] = "M3S1000"
+    board.power_cycle()
+    assert eventually(lambda: board.laser_on)
+    stage = open_grbl(StageParams(port=url, timeout_s=1.0, watchdog=False))
+    assert not board.laser_on
+    stage.start_turn(1.0, 0.3)
+    stage.laser(False)  # a reset in mid-way, for M5 would wait
+    assert not board.laser_on
+    stage.laser(True)
+    stage.close()
+    assert eventually(lambda: not board.laser_on and not board.motor_on) or board.dialect == "FluidNC"
+    assert not board.laser_on
+    assert grbl_opening.identify(url, StageParams(timeout_s=1.0)).startswith(board.dialect)
+    assert eventually(lambda: not board.laser_on)
+
+
+def test_an_owner_may_say_what_is_left_of_the_motors_hold(url: str, board: Firmware) -> None:
+    if board.dialect == "FluidNC":
+        pytest.skip("FluidNC has no numbered settings")
+    board.memory.settings[1] = 255.0  # left behind by a computer that lost power
+    for idle_ms, left in ((None, 25.0), (80.0, 80.0), (255.0, 255.0), (None, 25.0)):
+        open_grbl(StageParams(port=url, timeout_s=1.0, watchdog=False, idle_ms=idle_ms)).close()
+        assert board.memory.settings[1] == left
+
+
+def test_work_coordinates_whose_offset_no_report_tells(url: str, board: Firmware) -> None:
+    board.memory.settings[10] = 0
+    board.memory.offsets["G54"][0] = 7.0
+    stage = open_grbl(StageParams(port=url, timeout_s=1.0, watchdog=False))
+    for deg in (10.0, 55.0):
+        assert stage.move_to(math.radians(deg)) == pytest.approx(board.bearing, abs=1e-9)
+        assert math.degrees(board.bearing) == pytest.approx(deg, abs=1 / 80)
+    stage.close()
+
+
+def test_a_grblhal_that_takes_printable_commands_for_text_in_dollar_lines() -> None:
+    board = Firmware(dialect="grblHAL", switch_deg=-3.0, resets_on_open=False, instant=False)
+    board.memory.settings.update({22: 3, 23: 1, 39: 0, 25: 3600.0, 24: 3600.0, 26: 5.0})
+    board.power_cycle()
+    with plug(board) as url:  # asked for its status all the while it homes
+        stage = open_grbl(StageParams(port=url, timeout_s=0.2, homing="switch", home_deg=-2.0, min_deg=-2.0))
+        stage.move_to(math.radians(1.0))
+        assert math.degrees(board.bearing) == pytest.approx(1.0, abs=1 / 80)
+        stage.close()
+    assert not board.laser_on
+
+
+@pytest.mark.parametrize("dialect", ["grbl", "grblHAL", "FluidNC"])
+def test_a_limit_switch_in_mid_way_leaves_the_board_as_it_was_found(dialect: DialectName) -> None:
+    board = Firmware(dialect=dialect, instant=False)
+    board.memory.settings[1] = 40.0
+    with plug(board) as url:
+        stage = open_grbl(StageParams(port=url, timeout_s=0.5))
+        stage.laser(True)
+        stage.start_turn(3.0, 0.3)
+        board.trip_limit()
+        with pytest.raises(StageError, match="ALARM:1, a limit switch"):
+            stage.move_to(0.1)
+        stage.close()
+        assert eventually(lambda: board.state == "Alarm" and not board.laser_on)
+        assert board.memory.settings[1] == 40.0
+
+
+def test_fluidnc_is_never_told_a_numbered_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    board, sent = Firmware(dialect="FluidNC", switch_deg=-3.0), bytearray()
+    board.memory.settings.update({22: 1, 23: 1})
+    write = board.write
+    monkeypatch.setattr(board, "write", lambda data: (sent.extend(data), write(data))[1])
+    with plug(board) as url:
+        params = StageParams(port=url, homing="switch", steps_per_deg=80.0, acceleration_deg_s2=100.0, idle_ms=30.0)
+        stage = open_grbl(params)
+        stage.laser(True)
+        stage.move_to(1.0)
+        stage.home()
+        stage.close()
+        assert stage.last_words == ["M5", "$MD"]
+    assert b"$HX" in sent and not re.search(rb"\$\d+=", bytes(sent))
 
 
 def test_settings_are_written_once(url: str, board: Firmware) -> None:

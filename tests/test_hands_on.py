@@ -126,7 +126,7 @@ def test_stage_on_the_twin(run: Run) -> None:
     assert said.code == 0 and "DIGITAL TWIN" in said.out and "bearing 0.000 deg" in said.out
     assert "home, by hand" in run("stage", "home").out
     one_line(run("stage", "jog"), 2, "stage jog 10", "--to")
-    one_line(run("stage", "jog", "--", "-5"), 1, "outside 0 to 180")
+    one_line(run("stage", "jog", "--", "-5"), 2, "outside 0 to 180")
     one_line(run("stage", "laser", "blue"), 2, "blue", "on", "off")
     one_line(run("stage", "where", "--config", "srv-turntable"), 2, "has no stage")
     one_line(run("stage", "laser", "on", "--config", "thesis"), 2, "always-on", "own switch")
@@ -228,6 +228,37 @@ def test_a_signal_switches_the_laser_off_and_frees_the_motor(command: str, end: 
         assert not board.laser_on and not board.motor_on
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a pty needs POSIX")
+def test_ctrl_c_stops_a_jog_where_it_is_with_its_place_kept() -> None:
+    board = Firmware(instant=False)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    sent = bytearray()
+    with pty_port(board) as url:
+        write = board.write
+        board.write = lambda data: (sent.extend(data), write(data))[1]  # type: ignore[method-assign]
+        command = [sys.executable, "-c", LIT, url, "stage jog 90"]
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment) as process:
+            deadline = time.monotonic() + 60
+            while board.bearing < 0.1 and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.02)
+            assert board.state == "Jog"
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=30)
+        assert process.returncode == 130
+        assert b"$J=G53 G21 X90" in sent and sent.count(b"\x85") == 1 and b"!" not in sent
+        deadline = time.monotonic() + 5
+        while board.motor_on and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert 0.1 < board.bearing < 1.5 and board.state == "Idle" and not board.motor_on
+        assert board.planner.position()[0] == pytest.approx(math.degrees(board.bearing))
+
+
+@pytest.mark.parametrize("words", [("500",), ("--", "-200"), ("nan",), ("--to", "181"), ("--", "-5")])
+def test_a_jog_out_of_the_limits_is_a_usage_error(run: Run, words: tuple[str, ...]) -> None:
+    said = run("stage", "jog", *words)
+    assert said.code == 2 and "stage.max_deg" in said.err and len(said.err.splitlines()) == 1
+
+
 # init
 
 
@@ -249,6 +280,9 @@ def test_a_first_configuration_loads_and_is_never_overwritten(
     one_line(run("init", "--out", "my-rig.yaml"), 2, "my-rig.toml")
     one_line(run("init", "--out", "x.toml", "--gear", "-1"), 2, "steps_per_deg")
     one_line(run("init", "--out", "nowhere/x.toml"), 2, "nowhere")
+    for options in (("--gear", "nan"), ("--gear", "inf"), ("--gear", "0"), ("--baseline-m", "nan")):
+        said = run("init", "--out", "x.toml", *options)
+        assert said.code == 2 and not said.out  # said before anything is probed
     assert [path.name for path in tmp_path.iterdir()] == ["my-rig.toml"]
 
 

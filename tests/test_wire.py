@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+import time
 
 import pytest
 
 from scanmap.errors import ConfigError, StageError
 from scanmap.rig.grbl import GrblStage
 from scanmap.rig.grbl_link import GrblLink
-from scanmap.rig.grbl_protocol import Dialect, dialect_of_build_info, parse_banner, parse_status
+from scanmap.rig.grbl_protocol import (
+    Dialect,
+    dialect_of_build_info,
+    parse_banner,
+    parse_status,
+    real_time_of_build_info,
+)
 from scanmap.rig.manual import ManualStage
 from scanmap.rig.serial_port import SerialPort
 from scanmap.rig.stage import StageParams
@@ -55,6 +62,7 @@ def at(x: float, state: str = "Idle") -> bytes:
 
 OK = b"ok\r\n"
 PREAMBLE = (b"G21 G90 G94 G1 F1200.0\n", OK)
+SETTINGS_OF_SCANS = b"$1=255\r\n$10=1\r\n$13=0\r\n$32=0\r\n$100=80.000\r\n$110=1200.000\r\n$120=10.000\r\nok\r\n"
 OPEN_GRBL: Script = [
     (b"?", at(0)),
     (b"$$\n", b"$1=25\r\n$10=1\r\n$13=0\r\n$32=1\r\n$100=250.000\r\n$110=500.000\r\n$120=10.000\r\nok\r\n"),
@@ -62,6 +70,7 @@ OPEN_GRBL: Script = [
     (b"$1=255\n", OK),
     (b"$110=1200\n", OK),
     (b"$32=0\n", OK),
+    (b"$$\n", SETTINGS_OF_SCANS),
     PREAMBLE,
     (b"M5\n", OK),
 ]
@@ -157,7 +166,7 @@ def test_direction_and_home_bearing_turn_the_axis_round() -> None:
 def test_work_coordinates_and_inches_are_undone() -> None:
     opening = [*OPEN_GRBL]
     opening[0] = (b"?", b"<Idle|WPos:0.000,0.000,0.000|FS:0,0>\r\n")
-    opening[1] = (opening[1][0], opening[1][1].replace(b"$13=0", b"$13=1"))
+    opening = [(sent, reply.replace(b"$13=0", b"$13=1")) for sent, reply in opening]
     report = b"<Idle|WPos:1.000,0.000,0.000|FS:0,0>\r\n"
     offset = b"<Idle|WPos:1.000,0.000,0.000|FS:0,0|WCO:2.000,0.000,0.000>\r\n"
     opening.insert(1, (b"?", offset))
@@ -186,7 +195,7 @@ def test_a_hold_nobody_asked_for_is_released_once_then_said() -> None:
 
 
 def test_a_running_board_that_stands_still_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scanmap.rig.grbl_link.STILL_S", 0.01)
+    monkeypatch.setattr("scanmap.rig.grbl_wait.STILL_S", 0.01)
     line = b"G53 G1 X10.0000 F1200.0\n"
     stage, port = play([*OPEN_GRBL, (line, OK), (b"G4 P0.01\n", b""), (b"?", at(4, "Run")), (b"?", at(4, "Run"))])
     with pytest.raises(StageError, match="runs but stands at 4: check the motor"):
@@ -262,7 +271,7 @@ def test_settings_are_read_and_written_while_the_board_waits_in_alarm_for_its_ho
     script: Script = [
         (b"?", LOCKED),
         (b"$$\n", LOCKED + OPEN_GRBL[1][1]),  # a report overtakes the answer
-        *((sent, LOCKED + OK) for sent, _ in OPEN_GRBL[2:-2]),
+        *((sent, LOCKED + reply) for sent, reply in OPEN_GRBL[2:-2]),
         (b"\x18", UNLOCK),
         (b"?", LOCKED),
         (b"$H\n", OK),
@@ -333,7 +342,7 @@ def test_fluidnc_that_reports_inches() -> None:
 def test_steps_with_many_decimals_are_written_whole_and_counted_right(held: float, reported: float) -> None:
     """1600 steps for a turn; grbl prints 4.444 whichever it holds, and 800 steps are half a turn."""
     assert 800 / held == pytest.approx(reported, abs=5e-4)
-    new = [pair if pair[0] != b"$100=80\n" else (b"$100=4.444444\n", OK) for pair in OPEN_GRBL]
+    new = [(sent.replace(b"=80\n", b"=4.444444\n"), reply.replace(b"80.000", b"4.444")) for sent, reply in OPEN_GRBL]
     old = [(b"?", at(0)), (b"$$\n", (SETTINGS_22 % 0).replace(b"80.000", b"4.444")), PREAMBLE, (b"M5\n", OK)]
     for opening in (new, old):
         stage, port = play([*opening, *move(180.0, reported)], steps_per_deg=1600 / 360)
@@ -354,7 +363,7 @@ def test_the_index_mark_is_where_the_probe_says_also_in_inches() -> None:
     script = [
         *OPEN_GRBL[:1],
         (b"$$\n", inches),
-        *OPEN_GRBL[2:-2],
+        *((sent, reply.replace(b"$13=0", b"$13=1")) for sent, reply in OPEN_GRBL[2:-2]),
         (b"$X\n", OK),
         (b"?", place),
         PREAMBLE,
@@ -444,6 +453,131 @@ def test_a_stale_ok_is_not_taken_for_the_next_answer_even_from_a_port_that_tells
     link = GrblLink(SerialPort(port, "script"), 0.1)
     assert link.command("M5") == []
     assert link.command("$I") == ["[VER:1.1h:]"]
+    finish(port)
+
+
+def test_a_setting_that_a_damaged_line_stored_wrongly_is_written_again_then_refused() -> None:
+    lost = (b"$$\n", SETTINGS_OF_SCANS.replace(b"$110=1200", b"$110=10"))  # two characters got lost
+    again = [(b"$110=1200\n", OK), OPEN_GRBL[6]]
+    _, port = play([*OPEN_GRBL[:6], lost, *again, *OPEN_GRBL[7:]])
+    finish(port)
+    with pytest.raises(StageError, match=r"keeps \$110=10 although it was told 1200"):
+        play([*OPEN_GRBL[:6], lost, again[0], lost])
+
+
+def test_nothing_is_sent_while_a_board_writes_its_memory() -> None:
+    """An AVR hears nothing meanwhile: not even `?`, which is asked every 12 ms otherwise."""
+
+    class Writing(ScriptedPort):
+        told = 0.0
+
+        def write(self, data: bytes) -> int:
+            assert time.monotonic() - self.told > 0.09
+            self.told = time.monotonic() if data.startswith(b"$1=") else 0.0
+            return super().write(data)
+
+    port = Writing([(b"$1=255\n", b""), (b"?", at(0)), (b"?", at(0)), (b"$1=255\n", OK)])
+    assert GrblLink(SerialPort(port, "script"), 0.05).command("$1=255") == []
+    finish(port)
+
+
+def test_a_startup_line_that_lights_the_laser_is_undone_after_every_reset_and_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    banner = CLOSE_GRBL[-1][1]
+    lit = banner + b">G21:ok\r\n>M3S1000:ok\r\n"
+    off = (b"M5\n", OK)
+    opening = [(OPEN_GRBL[0][0], b">M3S1000:ok\r\n" + at(0)), *OPEN_GRBL[1:]]
+    reset = [(b"!", b""), (b"?", at(0)), (b"\x18", lit), (b"?", at(0)), PREAMBLE, off]
+    stage, port = play([*opening, *reset, *CLOSE_GRBL[:-1], (b"\x18", lit), off])
+    assert "switched its laser on by a startup line" in caplog.text
+    stage._link.stop()
+    stage.close()
+    finish(port)
+
+
+def test_a_startup_line_that_lights_no_laser_changes_nothing() -> None:
+    opening = [(OPEN_GRBL[0][0], b">G21M5:ok\r\n>M30:ok\r\n>M3:error:9\r\n" + at(0)), *OPEN_GRBL[1:]]
+    stage, port = play([*opening, *CLOSE_GRBL])
+    stage.close()
+    finish(port)
+
+
+def test_a_jog_goes_to_a_place_and_is_cancelled_by_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = b"$J=G53 G21 X10.0000 F1200.0\n"
+    stage, port = play([*OPEN_GRBL, (line, OK), (b"?", at(4, "Jog")), (b"?", at(10)), (b"?", at(10))])
+    assert stage.jog(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+    cancelled = [(b"\x85", b""), (b"?", at(4, "Jog")), (b"?", at(4.5)), (b"?", at(4.5))]
+    stage, port = play([*OPEN_GRBL, (line, OK), (b"?", at(4, "Jog")), *cancelled, *CLOSE_GRBL])
+    read_line = SerialPort.read_line
+
+    def interrupted(self: SerialPort, timeout_s: float) -> str | None:
+        if timeout_s == 0.051 and len(port.script) == len(cancelled) + len(CLOSE_GRBL):
+            raise KeyboardInterrupt
+        return read_line(self, timeout_s)
+
+    monkeypatch.setattr("scanmap.rig.grbl_link.BRAKE_POLL_S", 0.051)
+    monkeypatch.setattr(SerialPort, "read_line", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        stage.jog(math.radians(10))
+    assert stage.where() == pytest.approx(math.radians(4.5))
+    stage.close()
+    finish(port)
+
+
+def test_a_board_without_jogs_is_told_g1_and_one_that_refuses_this_jog_is_not() -> None:
+    line = b"$J=G53 G21 X10.0000 F1200.0\n"
+    stage, port = play([*OPEN_GRBL, *[(line, b"error:3\r\n")] * 2, *move(10)])
+    assert stage.jog(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+    stage, port = play([*OPEN_GRBL, *[(line, b"error:15\r\n")] * 2])
+    with pytest.raises(StageError, match=r"error:15, the jog would leave the travel set by \$130"):
+        stage.jog(math.radians(10))
+    finish(port)
+
+
+def test_a_grblhal_without_legacy_commands_is_asked_by_bytes_that_no_line_contains() -> None:
+    assert real_time_of_build_info(["[NEWOPT:ENUMS,RT-,HOME]"]) == (b"\x80", b"\x82", b"\x81")
+    assert real_time_of_build_info(["[NEWOPT:ENUMS,RT+]"]) == real_time_of_build_info([]) == (b"?", b"!", b"~")
+    port = ScriptedPort(
+        [(b"\x80", at(3)), (b"\x82", b""), (b"\x80", at(3)), (b"\x18", CLOSE_GRBL[-1][1]), (b"\x80", at(3))]
+    )
+    link = GrblLink(SerialPort(port, "script"), 0.2)
+    link.real_time = real_time_of_build_info(["[NEWOPT:RT-]"])
+    assert link.status().position[0] == 3
+    link.stop()
+    finish(port)
+
+
+def test_a_work_offset_that_no_report_tells_is_asked_for() -> None:
+    report = (b"?", b"<Idle|WPos:1.000,0.000,0.000|FS:0,0>\r\n")
+    modes = (b"$G\n", b"[GC:G0 G55 G17 G21 G90 G94 M5 M9 T0 F0 S0]\r\nok\r\n")
+    offsets = (
+        b"$#\n",
+        b"[G54:9.000,0.000,0.000]\r\n[G55:4.000,0.000,0.000]\r\n[G92:0.500,0.000,0.000]\r\n[TLO:0.000]\r\nok\r\n",
+    )
+    script = [*OPEN_HAL, *[report] * 13, modes, offsets, *move(10)[:2], (b"?", report[1].replace(b"1.000", b"5.500"))]
+    stage, port = play(script, Dialect.GRBLHAL)
+    assert stage.where() == pytest.approx(math.radians(5.5))
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
+def test_an_open_door_is_said_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scanmap.rig.grbl_wait.STILL_S", 0.01)
+    line = b"G53 G1 X10.0000 F1200.0\n"
+    ajar = at(4, "Door:1")
+    stage, port = play([*OPEN_GRBL, (line, b"[MSG:Check Door]\r\n"), (b"?", ajar), (b"?", ajar)])
+    with pytest.raises(StageError, match="is on door: release its hold button or close its door"):
+        stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_a_banner_that_noise_has_damaged_still_means_a_restart() -> None:
+    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000 F1200.0\n", b"r\x00bl 1.1h ['$' for help]\r\n")])
+    with pytest.raises(StageError, match="restarted by itself"):
+        stage.move_to(math.radians(10))
     finish(port)
 
 

@@ -95,6 +95,19 @@ class Stage(Protocol):
         ...
 
 
+@runtime_checkable
+class Jogging(Protocol):
+    """A stage that can be stopped in mid-way: an interruption of `jog` leaves the head where it is, its place kept."""
+
+    def jog(self, bearing: float) -> float:
+        """As `Stage.move_to`.
+
+        Raises:
+            StageError: outside the limits, no answer, or not arrived.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Rig:
     """A camera and a stage on one head; a context manager that closes both, laser first."""

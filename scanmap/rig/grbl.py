@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 
 from scanmap.errors import StageError
 from scanmap.rig import grbl_protocol as protocol
-from scanmap.rig.grbl_link import GrblLink
-from scanmap.rig.grbl_protocol import Dialect, Status
+from scanmap.rig.grbl_link import GrblLink, RefusedError
+from scanmap.rig.grbl_position import BoardPosition
+from scanmap.rig.grbl_protocol import Dialect
 from scanmap.rig.grbl_settings import fit_settings, idle_setting_afterwards
 from scanmap.rig.stage import StageParams, check_limits
 from scanmap.rig.watchdog import Watchdog
 
 HOMING_S = 120.0  # a board that homes answers nothing, not even `?`
-REPORT_DEG = 0.001  # resolution of a status report
-REPORT_INCH_DEG = 25.4e-4  # the same for a board that reports in inches ($13=1)
-STEP_DEG_UNKNOWN = 0.1  # how far off an arrival may be where the board does not tell its steps
-FAREWELL_S = 0.5  # how long the last reset may take to be confirmed
 
 logger = logging.getLogger(__name__)
 
@@ -38,9 +36,8 @@ class GrblStage:
         self._link = link
         self._params = params
         self.dialect = dialect
-        self._settings: dict[str, float] = {}
+        self._position = BoardPosition(link, params.steps_per_deg)
         self._zero_deg = 0.0  # the board's X where the head stands at home_deg
-        self._work_offset: tuple[float, ...] | None = None
         self._from_below = False  # whether the last arrival took up the play
         self._closed = False
         self._watchdog: Watchdog | None = None
@@ -68,18 +65,30 @@ class GrblStage:
         Raises:
             StageError: outside the limits, no answer, reset, alarm, or not arrived.
         """
-        target = math.degrees(bearing)
-        check_limits(target, self._params)
-        if self._params.backlash_deg:
-            way = target - self._where_deg()
-            if way < 0 or (not self._from_below and way < self._params.backlash_deg):
-                self._go(target - self._params.backlash_deg)
-            self._from_below = True
-        return math.radians(self._go(target))
+        return self._turn(bearing, self._arrive)
+
+    def jog(self, bearing: float) -> float:
+        """As `move_to`, but an interruption (Ctrl-C) stops the head where it is, with its place kept.
+
+        Raises:
+            StageError: as `move_to`.
+        """
+        return self._turn(bearing, self._arrive_by_jog)
 
     def watch_over(self, watchdog: Watchdog) -> None:
         """Keep a watchdog until `close`."""
         self._watchdog = watchdog
+
+    @property
+    def last_words(self) -> list[str]:
+        """What leaves the board in peace after a reset, should this program not come to it: laser off, motor free."""
+        if self.dialect.has_numbered_settings:
+            return [f"$1={self._idle_ms:g}", protocol.RESET.decode(), "M5"]
+        return ["M5", "$MD"]
+
+    @property
+    def _idle_ms(self) -> float:
+        return idle_setting_afterwards(self._position.settings, self._params)
 
     def start_turn(self, bearing: float, speed: float) -> None:
         """Begin to turn to `bearing` [rad] at `speed` [rad/s] and return at once; `move_to` then arrives.
@@ -119,7 +128,7 @@ class GrblStage:
         Raises:
             StageError: no answer.
         """
-        machine_deg = self._machine_deg(self._status())
+        machine_deg = self._position.now()
         self._zero_deg = machine_deg - self._params.direction * (math.degrees(bearing) - self._params.home_deg)
         self._from_below = False
 
@@ -161,7 +170,7 @@ class GrblStage:
         for line in self._link.preamble:
             self._link.command(line)
         by_index = self._params.homing == "index"
-        self._zero_deg = self._find_index() if by_index else self._machine_deg(self._status())
+        self._zero_deg = self._find_index() if by_index else self._position.now()
         self._from_below = False
         return self.where()
 
@@ -175,14 +184,12 @@ class GrblStage:
             if self._link.in_motion:
                 self._link.stop()
             if self.dialect.has_numbered_settings:  # the reset that follows lets the motor go
-                self._link.command(f"$1={idle_setting_afterwards(self._settings):g}", despite_fault=True)
+                self._link.command(f"$1={self._idle_ms:g}", despite_fault=True)
         except StageError as error:
             logger.warning("%s was not shut down in order but told to reset (%s)", self._link.name, error)
         finally:
             try:
-                self._link.send_reset()
-                if self._link.await_banner(FAREWELL_S) and not self.dialect.has_numbered_settings:
-                    self._link.command("$MD", despite_fault=True)  # before the reset it would be undone by it
+                self._link.leave(*([] if self.dialect.has_numbered_settings else ["$MD"]))
             except StageError:
                 logger.warning("%s is gone: switch the laser off by hand", self._link.name)
             self._link.close()
@@ -190,10 +197,10 @@ class GrblStage:
                 self._watchdog.dismiss()
 
     def _prepare(self) -> None:
-        if self._status().state == "Alarm" and self._params.homing != "switch":
+        if self._position.status().state == "Alarm" and self._params.homing != "switch":
             self._unlock()
         self._link.fault = None
-        self._settings = fit_settings(self._link, self.dialect, self._params)
+        self._position.settings = fit_settings(self._link, self.dialect, self._params)
         # G1 as the standing mode: a board in laser mode lights a standing laser only then.
         self._link.preamble = [f"G21 G90 G94 G1 F{self._params.speed_deg_s * 60:.1f}"]
         if self._params.homing == "hand":
@@ -202,11 +209,17 @@ class GrblStage:
         else:
             self.home()
         self.laser(False)
+        if self._link.lit_by_startup and self.laser_switchable:
+            logger.warning(
+                "%s switched its laser on by a startup line, and does so after every reset: clear $N0 and $N1 "
+                "(`$N0=`); it is off now",
+                self._link.name,
+            )
 
     def _unlock(self) -> None:
         for attempt in range(2):
             self._link.command("$X", despite_fault=True)
-            if self._status().state != "Alarm":
+            if self._link.status().state != "Alarm":
                 break
             if attempt == 0:
                 self._link.reset()
@@ -216,10 +229,10 @@ class GrblStage:
 
     def _seek_switch(self) -> None:
         alone = self.dialect is Dialect.FLUIDNC or (
-            self.dialect is Dialect.GRBLHAL and bool(int(self._settings.get("22", 0.0)) & 2)
+            self.dialect is Dialect.GRBLHAL and bool(int(self._position.settings.get("22", 0.0)) & 2)
         )
         self._link.command("$HX" if alone else "$H", despite_fault=True, silence_s=HOMING_S)
-        if self._status().state == "Alarm":  # grbl says ok although it found no switch
+        if self._link.status().state == "Alarm":  # grbl says ok although it found no switch
             raise StageError(self._link.fault or f"stage {self._link.name} could not home")
 
     def _find_index(self) -> float:
@@ -231,67 +244,48 @@ class GrblStage:
         found = next(filter(None, map(protocol.parse_probe, answers)), None)
         if found is None:
             raise StageError(f"stage {self._link.name} did not say where the index mark is: check the probe input")
-        return self._whole_steps(found)
+        return self._position.whole_steps(found)
 
-    def _go(self, target_deg: float) -> float:
+    def _turn(self, bearing: float, arrive: Callable[[float], None]) -> float:
+        target = math.degrees(bearing)
+        check_limits(target, self._params)
+        if self._params.backlash_deg:
+            way = target - self._where_deg()
+            if way < 0 or (not self._from_below and way < self._params.backlash_deg):
+                self._go(target - self._params.backlash_deg, arrive)
+            self._from_below = True
+        return math.radians(self._go(target, arrive))
+
+    def _go(self, target_deg: float, arrive: Callable[[float], None]) -> float:
         """Move, prove the arrival, and return the bearing reported [deg]."""
-        params = self._params
-        x = self._x_of(target_deg)
         here = math.nan
         for _ in range(2):  # a line damaged on its way can name another target
-            self._link.command(f"G53 G1 X{x:.4f} F{params.speed_deg_s * 60:.1f}")
-            self._link.command("G4 P0.01")  # answered only when all that was planned is done
-            self._link.in_motion = False
+            arrive(self._x_of(target_deg))
             here = self._where_deg()
-            step = 1.0 / self._settings["100"] if self._settings.get("100") else STEP_DEG_UNKNOWN
-            if abs(here - target_deg) <= step + self._report_deg:
+            if abs(here - target_deg) <= self._position.arrival_deg:
                 return here
         raise StageError(
             f"stage {self._link.name} was asked for {target_deg:g} deg and stands at {here:g}: check for a blocked "
             "head or a limit switch, then `scanmap stage home`"
         )
 
+    def _arrive(self, x: float) -> None:
+        self._link.command(f"G53 G1 X{x:.4f} F{self._params.speed_deg_s * 60:.1f}")
+        self._link.command("G4 P0.01")  # answered only when all that was planned is done
+        self._link.in_motion = False
+
+    def _arrive_by_jog(self, x: float) -> None:
+        """A jog to a place, not by a distance: sent twice for a lost `ok`, it must not go twice as far."""
+        try:
+            self._link.jog(f"$J=G53 G21 X{x:.4f} F{self._params.speed_deg_s * 60:.1f}")
+        except RefusedError as refusal:
+            if not refusal.is_unknown:
+                raise
+            self._arrive(x)
+
     def _x_of(self, bearing_deg: float) -> float:
         """The board's X at a bearing."""
         return self._zero_deg + self._params.direction * (bearing_deg - self._params.home_deg)
 
     def _where_deg(self) -> float:
-        x = self._machine_deg(self._status())
-        return self._params.home_deg + self._params.direction * (x - self._zero_deg)
-
-    def _status(self) -> Status:
-        status = self._link.status()
-        if status.work_offset is not None:
-            self._work_offset = status.work_offset
-        for _ in range(40):  # the offset comes with every 10th to 30th report
-            if not status.is_work or self._work_offset is not None:
-                break
-            status = self._link.status()
-            self._work_offset = status.work_offset
-        return status
-
-    def _machine_deg(self, status: Status) -> float:
-        """The board's X [deg]."""
-        x = status.position[0]
-        if status.is_work and self._work_offset:
-            x += self._work_offset[0]
-        return self._whole_steps(x)
-
-    @property
-    def _report_deg(self) -> float:
-        return REPORT_INCH_DEG if self._settings.get("13") else REPORT_DEG
-
-    def _whole_steps(self, reported: float) -> float:
-        """A reported X [deg] as the whole motor step that it stands for.
-
-        A board tells `$100` with three decimals (4.444 for 4.44444), whatever it counts with. That is enough to
-        know the step; where the rig says how many make a degree, the rig is believed.
-        """
-        x = reported * 25.4 if self._settings.get("13") else reported  # $13 makes degrees "inches" too
-        told = self._settings.get("100")
-        if not told:
-            return x
-        count = round(x * told)
-        if self._params.steps_per_deg:
-            return count / self._params.steps_per_deg
-        return count / told if abs(count / told - x) <= self._report_deg else x
+        return self._params.home_deg + self._params.direction * (self._position.now() - self._zero_deg)

@@ -13,18 +13,28 @@ import time
 
 from scanmap.errors import StageError
 from scanmap.rig import grbl_protocol as protocol
-from scanmap.rig.grbl_protocol import Banner, Status
+from scanmap.rig.grbl_protocol import Banner, RealTime, Status
+from scanmap.rig.grbl_wait import WRITING_S, Wait
 from scanmap.rig.serial_port import SerialPort
 
 POLL_S = 0.25  # `?` while waiting, or more often for a short time-out; grbl wants no more than 5 to 10 a second
-BUSY_STATES = ("Run", "Jog", "Home", "Hold", "Door")  # a board in another state has nothing left to do
 BRAKE_POLL_S = 0.05
 ATTEMPTS = 3
 SILENT_PATIENCE_S = 0.3  # so that leaving a dead board does not take a minute
 LATE_BANNER_S = 0.5
-STILL_S = 3.0  # a board that is running but whose position stands this long is stuck
+BRAKING_S = 3.0  # longer than any head needs to come to rest
+STARTUP_S = 0.03  # after its banner a board says what its stored lines did
+FAREWELL_S = 0.8  # how long the last reset may take to be confirmed; grbl waits 0.5 s to say an alarm
 
 logger = logging.getLogger(__name__)
+
+
+class RefusedError(StageError):
+    """The board has answered `error:n`."""
+
+    def __init__(self, message: str, answer: str) -> None:
+        super().__init__(message)
+        self.is_unknown = answer.startswith("error:3,")  # a $ command that this board does not have
 
 
 class GrblLink:
@@ -39,6 +49,8 @@ class GrblLink:
         self.in_motion = False  # True between the start of a turn and its arrival
         self.preamble: list[str] = []  # sent after every reset that was asked for
         self.latches_errors = False  # grblHAL: after an error it refuses all G-code until it hears an empty line
+        self.real_time = RealTime()
+        self.lit_by_startup = False  # one of the board's stored lines switches its laser on, after every reset
         self.fault: str | None = None  # why commands are refused: position lost, alarm
 
     @property
@@ -56,8 +68,8 @@ class GrblLink:
         Raises:
             StageError: refused, reset, alarm, no answer, or the port is gone.
         """
-        if len(line) + 1 > protocol.RX_BUFFER_BYTES:
-            raise StageError(f"line of {len(line)} characters does not fit the board's buffer of 127: {line[:40]}...")
+        if len(line) > protocol.LINE_CHARACTERS:
+            raise StageError(f"a line of {len(line)} characters is longer than the board's 79: {line[:40]}...")
         if not self._answered:
             self.stop()
         answer = refusal = ""
@@ -68,7 +80,9 @@ class GrblLink:
                 raise StageError(self.fault)
             self._answered = False
             self._port.write_line(line)
-            answer, information = self._await_answer(silence_s or self._patience_s, despite_fault)
+            peace_s = WRITING_S if protocol.writes_memory(line) else 0.0
+            wait = Wait(self.name, silence_s or self._patience_s, self._poll_s, peace_s=peace_s)
+            answer, information = self._await_answer(wait, despite_fault)
             self._answered = True
             if answer == "ok":
                 return information
@@ -80,7 +94,31 @@ class GrblLink:
             logger.warning("%s: %s; sent again", self.name, refusal)
         if not answer and self.fault:
             raise StageError(self.fault)
-        raise StageError(f"stage {self.name} refused {line!r}: {refusal}")
+        raise RefusedError(f"stage {self.name} refused {line!r}: {refusal}", refusal)
+
+    def jog(self, line: str) -> None:
+        """Send a `$J=` line and wait until the head stands; an interruption brakes it, with its place kept.
+
+        Raises:
+            RefusedError: by the board, for instance because it knows no jogs.
+            StageError: alarm, reset, stuck, no answer, or the port is gone.
+        """
+        try:
+            self.command(line)
+            wait = Wait(self.name, self._patience_s, self._poll_s)
+            while not self._is_at_rest(status := self.status()):
+                wait.is_over(status)
+                if line_heard := self._port.read_line(BRAKE_POLL_S):
+                    self._note(line_heard)
+        except RefusedError:
+            raise
+        except BaseException:
+            with contextlib.suppress(StageError):
+                self._port.write(protocol.JOG_CANCEL)
+                self._await_rest()
+            raise
+        if self.fault:
+            raise StageError(self.fault)
 
     def status(self) -> Status:
         """Ask for a status report until one comes.
@@ -90,7 +128,7 @@ class GrblLink:
         """
         deadline = time.monotonic() + self._patience_s
         while time.monotonic() < deadline:
-            self._port.write(protocol.STATUS)
+            self._port.write(self.real_time.status)
             asked = time.monotonic()
             while (line := self._port.read_line(max(0.0, asked + self._poll_s - time.monotonic()))) is not None:
                 self._patience_s = self._timeout_s
@@ -104,7 +142,7 @@ class GrblLink:
         Raises:
             StageError: the board does not answer.
         """
-        self._port.write(protocol.HOLD)
+        self._port.write(self.real_time.hold)
         with contextlib.suppress(StageError):  # a board halted by an alarm obeys nothing but the reset
             self._await_rest()
         self.reset()
@@ -125,6 +163,8 @@ class GrblLink:
                 self._answered, self.in_motion = True, False
                 for line in self.preamble if self.status().state != "Alarm" else []:
                     self.command(line, despite_fault=True)
+                if self.lit_by_startup:
+                    self.command("M5", despite_fault=True)
                 return banner
         raise StageError(self._silence())
 
@@ -139,9 +179,21 @@ class GrblLink:
             self._note(line)
         return None
 
-    def send_reset(self) -> None:
-        """Reset without waiting: the last means to switch a laser off."""
+    def leave(self, *last_words: str) -> None:
+        """Reset as the last means to switch a laser off, then say what the reset would have undone.
+
+        Raises:
+            StageError: the port is gone, or a last word got no answer.
+        """
         self._port.write(protocol.RESET)
+        if self.await_banner(FAREWELL_S):
+            self._answered, self.in_motion = True, False
+            while line := self._port.read_line(STARTUP_S):
+                self._note(line)
+            for word in last_words:
+                self.command(word, despite_fault=True)
+            if self.lit_by_startup:
+                self.command("M5", despite_fault=True)
 
     def close(self) -> None:
         """Free the port; never raises."""
@@ -150,21 +202,22 @@ class GrblLink:
     def _clear_error(self) -> None:
         self._answered = False
         self._port.write_line("")
-        self._await_answer(self._patience_s, despite_fault=True)
+        self._await_answer(Wait(self.name, self._patience_s, self._poll_s), despite_fault=True)
         self._answered = True
 
     def _await_rest(self) -> None:
-        deadline = time.monotonic() + max(self._patience_s, STILL_S)
+        deadline = time.monotonic() + max(self._patience_s, BRAKING_S)
         while time.monotonic() < deadline:
-            status = self.status()
-            if status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate):
+            if self._is_at_rest(self.status()):
                 return
             if line := self._port.read_line(BRAKE_POLL_S):
                 self._note(line)
 
-    def _await_answer(self, silence_s: float, despite_fault: bool) -> tuple[str, list[str]]:
+    def _is_at_rest(self, status: Status) -> bool:
+        return status.state not in ("Run", "Jog", "Home") and not (status.state == "Hold" and status.substate)
+
+    def _await_answer(self, wait: Wait, despite_fault: bool) -> tuple[str, list[str]]:
         """`ok`, an error in words, or `""` where the board rests and the answer got lost."""
-        wait = _Wait(silence_s, self._poll_s)
         information: list[str] = []
         while True:
             line = self._port.read_line(self._poll_s)
@@ -181,23 +234,26 @@ class GrblLink:
                     raise StageError(self.fault)
                 if status is None:
                     information.append(line)
-                elif wait.is_over(status, self._port):
+                elif wait.is_over(status):
                     return "", information
+                elif wait.resume_due(status):
+                    self._port.write(self.real_time.resume)
             elif wait.is_silent():
                 raise StageError(self._silence())
             if wait.poll_due():
-                self._port.write(protocol.STATUS)
+                self._port.write(self.real_time.status)
 
     def _note(self, line: str) -> Status | None:
         """Keep what an unasked line means; returns a status report."""
         code = protocol.parse_code(line)
         if code and code[0] == "ALARM":
             self.fault = f"stage {self.name} stopped with {protocol.explain(*code)}"
-        elif protocol.parse_banner(line) and not self.fault:  # after a failed homing the board restarts too
+        elif protocol.is_greeting(line) and not self.fault:  # after a failed homing the board restarts too
             self.fault = (
                 f"stage {self.name} restarted by itself, so its position is lost: check its power supply, "
                 "then `scanmap stage home`"
             )
+        self.lit_by_startup |= protocol.lights_laser(line)
         status = protocol.parse_status(line)
         if status and status.state == "Alarm" and not self.fault:
             words = protocol.explain("ALARM", status.substate) if status.substate else "alarm: `scanmap stage home`"
@@ -210,55 +266,3 @@ class GrblLink:
             f"stage {self.name} has not answered for {self._timeout_s:g} s: check its power and cable, "
             "then `scanmap doctor`"
         )
-
-
-class _Wait:
-    """How long to wait for an answer: as long as the board is alive and busy."""
-
-    def __init__(self, silence_s: float, poll_s: float) -> None:
-        now = time.monotonic()
-        self._poll_s = poll_s
-        self._silence_s = silence_s
-        self._heard = self._polled = self._moved = now
-        self._position: tuple[float, ...] | None = None
-        self._unanswered_polls = self._resting_reports = 0
-        self._resumed = False
-
-    def is_silent(self) -> bool:
-        return time.monotonic() - self._heard > self._silence_s
-
-    def poll_due(self) -> bool:
-        now = time.monotonic()
-        if now - self._polled < self._poll_s:
-            return False
-        self._polled = now
-        self._unanswered_polls += 1
-        return True
-
-    def is_over(self, status: Status, port: SerialPort) -> bool:
-        """Whether the report proves that no answer will come.
-
-        Raises:
-            StageError: the board is held or stuck.
-        """
-        now = self._heard = time.monotonic()
-        if status.position != self._position:
-            self._position, self._moved = status.position, now
-        if status.state in BUSY_STATES:
-            self._resting_reports = 0
-        elif self._unanswered_polls:  # a report that the board sends by itself can be older than the line
-            self._resting_reports += 1
-        self._unanswered_polls = 0
-        if status.state in ("Hold", "Door") and status.substate == 0:
-            if self._resumed:
-                raise StageError(
-                    f"stage {port.name} is on {status.state.lower()}: release its hold button or close its door, "
-                    "then start again"
-                )
-            port.write(protocol.RESUME)
-            self._resumed = True
-        if status.state == "Run" and now - self._moved > STILL_S:
-            raise StageError(
-                f"stage {port.name} runs but stands at {status.position[0]:g}: check the motor, then home it"
-            )
-        return self._resting_reports >= 2

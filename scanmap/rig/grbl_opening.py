@@ -47,9 +47,12 @@ def identify(url: str, params: StageParams) -> str:
     link = GrblLink(open_serial(url, params.baud), params.timeout_s)
     try:
         banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
-        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
+        dialect = _dialect(link, banner.dialect)
         return f"{dialect.value} {banner.version}"
     finally:
+        if link.lit_by_startup:
+            with contextlib.suppress(StageError):
+                link.command("M5", despite_fault=True)
         link.close()
 
 
@@ -60,13 +63,19 @@ def _open_port(url: str, params: StageParams) -> GrblStage:
         banner = link.await_banner(BOOT_S if "://" not in url else GREETING_S) or link.reset()
         if banner.dialect is Dialect.GRBL and banner.version.startswith("0."):
             raise StageError(f"{url} runs grbl {banner.version}: flash grbl 1.1 or newer")
-        dialect = protocol.dialect_of_build_info(link.command("$I", despite_fault=True), banner.dialect)
+        dialect = _dialect(link, banner.dialect)
         stage = GrblStage(link, dialect, params)
         if params.watchdog and stage.laser_switchable and not url.startswith("twin://"):
-            stage.watch_over(Watchdog(url, params.baud))
+            stage.watch_over(Watchdog(url, params.baud, stage.last_words))
         return stage
     except BaseException:
         with contextlib.suppress(StageError):
-            link.send_reset()  # it may be homing
+            link.leave()  # it may be homing
         link.close()
         raise
+
+
+def _dialect(link: GrblLink, told_by_banner: Dialect) -> Dialect:
+    build_info = link.command("$I", despite_fault=True)
+    link.real_time = protocol.real_time_of_build_info(build_info)
+    return protocol.dialect_of_build_info(build_info, told_by_banner)

@@ -13,12 +13,21 @@ from enum import Enum
 from typing import NamedTuple
 
 # Real-time bytes: acted on at once, never queued, never answered by `ok`.
-STATUS = b"?"
-HOLD = b"!"
-RESUME = b"~"
 RESET = b"\x18"
+JOG_CANCEL = b"\x85"
 
-RX_BUFFER_BYTES = 127  # what may be sent and not yet answered; real ones hold 128 or more
+LINE_CHARACTERS = 79  # grbl's line buffer; its receive buffer of 128 bytes holds one line of ours at any time
+
+
+class RealTime(NamedTuple):
+    """Real-time bytes that have two names."""
+
+    status: bytes = b"?"
+    hold: bytes = b"!"
+    resume: bytes = b"~"
+
+
+OUT_OF_TEXT = RealTime(b"\x80", b"\x82", b"\x81")  # grblHAL's own, which no line can contain
 
 ERRORS = {
     1: "a G-code word lost its letter",
@@ -112,6 +121,7 @@ class Status(NamedTuple):
     work_offset: tuple[float, ...] | None  # only in some reports
 
 
+_STARTUP_LIGHT = re.compile(r">.*M0*[34](?!\d).*:ok$")
 _BANNER = re.compile(r"\bGrbl(?P<hal>HAL)? (?P<version>[\d.]+\w*) ?\[(?P<rest>[^\]]*)")
 _CODE = re.compile(r"(?P<kind>error|ALARM): ?(?P<code>\d+)$")
 _SETTING = re.compile(r"\$(?P<name>[\w/]+)=(?P<value>-?\d+(\.\d+)?)(?=$|\s)")
@@ -134,6 +144,33 @@ def dialect_of_build_info(lines: list[str], otherwise: Dialect) -> Dialect:
     if "FluidNC" in text:
         return Dialect.FLUIDNC
     return Dialect.GRBLHAL if "grblHAL" in text else otherwise
+
+
+def real_time_of_build_info(lines: list[str]) -> RealTime:
+    """Which real-time bytes to use: a grblHAL with `RT-` takes the printable ones for text inside `$` lines."""
+    options = next((line for line in lines if line.startswith("[NEWOPT:")), "")
+    return OUT_OF_TEXT if "RT-" in re.split(r"[:,\]]", options) else RealTime()
+
+
+def is_greeting(line: str) -> bool:
+    """Whether a board says this when it restarts; a damaged banner counts too."""
+    return parse_banner(line) is not None or "for help]" in line
+
+
+def lights_laser(line: str) -> bool:
+    """Whether a board tells that one of its stored startup lines has just switched the laser on."""
+    return _STARTUP_LIGHT.match(line) is not None
+
+
+def writes_memory(line: str) -> bool:
+    """Whether a board stores what this line says."""
+    return re.match(r"\$(N\d)?\d*=", line) is not None
+
+
+def parse_offsets(lines: list[str]) -> dict[str, tuple[float, ...]]:
+    """The answer to `$#`: `[G54:4.000,0.000,0.000]` gives `{"G54": (4.0, 0.0, 0.0)}`."""
+    pairs = (line[1:-1].split(":", 1) for line in lines if line.startswith("[") and line.endswith("]") and ":" in line)
+    return {name: place for name, text in pairs if (place := _numbers(text)) is not None}
 
 
 def parse_status(line: str) -> Status | None:

@@ -12,6 +12,7 @@ from scanmap.rig.stage import StageParams
 
 HOLD_FOREVER = 255.0  # $1: the motor holds between moves
 IDLE_MS_DEFAULT = 25.0  # $1 of a fresh board
+WRITES = 2  # a setting that is wrong after being written so often is an error
 
 logger = logging.getLogger(__name__)
 
@@ -29,29 +30,50 @@ def fit_settings(link: GrblLink, dialect: Dialect, params: StageParams) -> dict[
     return _compare_yaml(link, params)
 
 
-def idle_setting_afterwards(settings: dict[str, float]) -> float:
+def idle_setting_afterwards(settings: dict[str, float], params: StageParams) -> float:
     """`$1` [ms] with which to leave the board, so that its motor is free."""
-    before = settings.get("1", IDLE_MS_DEFAULT)
-    return IDLE_MS_DEFAULT if before == HOLD_FOREVER else before  # 255 was left behind by a run that was killed
+    before = settings.get("1", IDLE_MS_DEFAULT) if params.idle_ms is None else params.idle_ms
+    if params.idle_ms is None and before == HOLD_FOREVER:
+        return IDLE_MS_DEFAULT  # left behind by a run that neither ended nor had a watchdog
+    return before
 
 
 def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
-    """Write only what differs: the board's memory wears out."""
-    # A board that waits for its homing is in alarm, and takes settings all the same.
-    settings = dict(filter(None, map(parse_setting, link.command("$$", despite_fault=True))))
+    """Write only what differs: the board's memory wears out. Read it back: a damaged line may store anything."""
+    found = settings = _read_numbered(link)
+    for _ in range(WRITES):
+        wrong = _wrong_settings(settings, params)
+        for number, value in wrong.items():
+            link.command(f"${number}={value:.6f}".rstrip("0").rstrip("."), despite_fault=True)
+        if not wrong:
+            break
+        settings = _read_numbered(link)
+    if wrong := _wrong_settings(settings, params):
+        number, value = next(iter(wrong.items()))
+        kept = settings.get(number, math.nan)
+        raise StageError(f"stage {link.name} keeps ${number}={kept:g} although it was told {value:g}: set it by hand")
+    exact = {"100": params.steps_per_deg} if params.steps_per_deg and found.get("100") != settings.get("100") else {}
+    return settings | exact | {number: found[number] for number in ("1",) if number in found}
+
+
+def _read_numbered(link: GrblLink) -> dict[str, float]:
+    # A board that waits for its homing is in alarm, and tells and takes settings all the same.
+    return dict(filter(None, map(parse_setting, link.command("$$", despite_fault=True))))
+
+
+def _wrong_settings(settings: dict[str, float], params: StageParams) -> dict[str, float]:
+    """What must be written, by number."""
     wanted = {"100": params.steps_per_deg, "120": params.acceleration_deg_s2, "1": HOLD_FOREVER}
     feed = params.speed_deg_s * 60
     if settings.get("110", feed) < feed:
         wanted["110"] = feed
     if params.laser == "grbl" and "32" in settings:  # some builds know no laser mode
         wanted["32"] = 0.0
-    for number, value in wanted.items():
-        if value is None or math.isclose(settings.get(number, math.nan), value, abs_tol=6e-4):
-            continue
-        link.command(f"${number}={value:.6f}".rstrip("0").rstrip("."), despite_fault=True)
-        if number != "1":
-            settings[number] = value
-    return settings
+    return {
+        number: value
+        for number, value in wanted.items()
+        if value is not None and not math.isclose(settings.get(number, math.nan), value, rel_tol=2e-6, abs_tol=6e-4)
+    }
 
 
 def _compare_yaml(link: GrblLink, params: StageParams) -> dict[str, float]:

@@ -53,6 +53,12 @@ class StageParams(BaseModel, frozen=True, extra="forbid"):
         description="hand (the head stands at home_deg when the port opens), switch ($H), index (probe input)",
     )
     home_deg: float = Field(0.0, ge=-3600.0, le=3600.0, description="bearing of the head at home [deg]")
+    idle_ms: float | None = Field(
+        None,
+        ge=0.0,
+        le=255.0,
+        description="$1 with which the board is left, 255 = the motor goes on holding; none = as it was found [ms]",
+    )
     laser: Literal["grbl", "always-on"] = Field(
         "grbl", description="grbl (M3/M5 of the board), always-on (on batteries: software cannot switch it)"
     )

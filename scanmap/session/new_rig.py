@@ -92,6 +92,7 @@ def first_config(
     """
     if path.exists():
         raise ConfigError(f"{path} exists and is not overwritten: choose another --out, or move it away")
+    _configuration(Found("auto", DEFAULT_SIZE, "auto", []), drive, head, laser)  # numbers that make no rig: said now
     found = look_around()
     yield from found.lines
     if camera is not None and (chosen := int(camera) if camera.isdigit() else camera) != found.camera:
@@ -114,6 +115,20 @@ def write_first_config(path: Path, found: Found, drive: Drive, head: Head, *, la
     """
     if path.suffix != ".toml":
         raise ConfigError(f"--out {path}: must end in .toml; try {path.with_suffix('.toml')}")
+    config = _configuration(found, drive, head, laser)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in _text(config, drive))
+    except FileExistsError as error:
+        raise ConfigError(f"{path} exists and is not overwritten: choose another --out, or move it away") from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written ({error.strerror}): choose another --out") from error
+    return config
+
+
+def _configuration(found: Found, drive: Drive, head: Head, laser: str) -> Config:
+    import tomli_w
+
     size = found.size
     document: dict[str, Any] = {
         "description": "a first configuration: measure the head, then calibrate it",
@@ -123,17 +138,7 @@ def write_first_config(path: Path, found: Found, drive: Drive, head: Head, *, la
         "stage": {"port": found.port, "steps_per_deg": drive.steps_per_deg, "laser": laser},
         "sweep": {"off_frames": laser == "grbl"},
     }
-    import tomli_w
-
-    config = parse(tomli_w.dumps(document), "the first configuration")
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.writelines(f"{line}\n" for line in _text(config, drive))
-    except FileExistsError as error:
-        raise ConfigError(f"{path} exists and is not overwritten: choose another --out, or move it away") from error
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written ({error.strerror}): choose another --out") from error
-    return config
+    return parse(tomli_w.dumps(document), "the first configuration")
 
 
 def _size_of(source: int | str) -> tuple[tuple[int, int], str]:

@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable
 
 from scanmap.config import Config
-from scanmap.errors import ConfigError
-from scanmap.rig import Stage
+from scanmap.errors import ConfigError, StageError
+from scanmap.rig import Jogging, Stage
+from scanmap.rig.stage import check_limits
 from scanmap.session.rigs import TWIN_NAME, opened_stage
 
 Say = Callable[[str], None]
@@ -19,17 +20,27 @@ def jog(config: Config, by_deg: float | None, to_deg: float | None, say: Say) ->
     """Turn by, or to, some degrees and say where the head then stands.
 
     Raises:
-        ConfigError: neither or both are given.
-        StageError: no board, or it cannot turn there.
+        ConfigError: neither or both are given, or the bearing is outside the limits.
+        StageError: no board, or it does not turn there.
     """
     if (by_deg is None) == (to_deg is None):
         raise ConfigError(
             "stage jog wants one of the two: degrees to turn by (scanmap stage jog 10), or --to a bearing"
         )
+    span_deg = config.stage.max_deg - config.stage.min_deg
+    if to_deg is not None:
+        _refuse_outside(to_deg, config)
+    elif not abs(by_deg or 0.0) <= span_deg:
+        raise ConfigError(
+            f"stage jog {by_deg:g}: the head may turn from {config.stage.min_deg:g} to {config.stage.max_deg:g} deg, "
+            f"so by no more than {span_deg:g}; see stage.min_deg, stage.max_deg"
+        )
     with opened_stage(config) as stage:
         _introduce(config, stage, say)
-        target = math.radians(to_deg) if to_deg is not None else stage.where() + math.radians(by_deg or 0.0)
-        say(f"bearing {math.degrees(stage.move_to(target)):.3f} deg")
+        target = to_deg if to_deg is not None else math.degrees(stage.where()) + (by_deg or 0.0)
+        _refuse_outside(target, config)
+        turn = stage.jog if isinstance(stage, Jogging) else stage.move_to
+        say(f"bearing {math.degrees(turn(math.radians(target))):.3f} deg")
 
 
 def home(config: Config, say: Say) -> None:
@@ -87,6 +98,13 @@ def switch_laser(
                 stage.where()  # notices a board that is gone
         stage.laser(False)
     say("laser off")
+
+
+def _refuse_outside(bearing_deg: float, config: Config) -> None:
+    try:
+        check_limits(bearing_deg, config.stage)
+    except StageError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _unmoved(config: Config) -> Config:
