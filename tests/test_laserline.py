@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import board_lines
 import cv2
 import numpy as np
 import pytest
@@ -351,6 +352,30 @@ def test_the_lasers_channel_is_told_on_a_white_board_in_a_bright_room(data):
     files = sorted((data / "real" / "srv-calib" / "laser").glob("*.jpg"))[::4]
     channels = [laser_channel(np.asarray(cv2.imread(str(file)), np.uint8)) for file in files]
     assert np.mean(np.array(channels) == 1) >= 0.95
+
+
+def boards_found(data, numbers, params, change=None):
+    """Share of the rows found where a board carries the line, and beside it; and of all rows found elsewhere."""
+    folder = data / "real" / "srv-calib" / "laser"
+    carry, found, astray = np.zeros(2), np.zeros(2), 0
+    for number in numbers:
+        image, columns = board_lines.picture(folder, number), board_lines.marked(number)
+        on_board, beside = board_lines.carrying(image, columns)
+        column = find_laser_line(image if change is None else change(image), params).column_px
+        off = np.abs(column - columns)
+        near = ((off <= 4.0) & np.stack([on_board, beside])).any(axis=0)
+        for k, rows in enumerate((on_board, beside & ~on_board)):
+            carry[k], found[k] = carry[k] + rows.sum(), found[k] + (rows & near).sum()
+        astray += (np.isfinite(column) & ~(off <= 6.0).any(axis=0)).sum()
+    return (*found / carry, astray / (480 * len(numbers)))
+
+
+@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.9, 0.03), ("green", 0.91, 0.01)])
+def test_a_line_on_white_boards_before_a_cabinet_full_of_things(data, grey, least, most_astray):
+    on_board, beside, astray = boards_found(data, board_lines.NUMBERS[::4], LaserLineParams(grey=grey))
+    assert on_board >= least
+    assert beside >= 0.55
+    assert astray <= most_astray
 
 
 def test_white_between_red_stripes_is_no_green_laser():

@@ -12,6 +12,7 @@ from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates, is_large
 from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
 from scanmap.laserline.runs import numbered
+from scanmap.laserline.shares import HALF, across, flank_lead, light_added
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -19,22 +20,18 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 _GREY = 6  # [grey levels] what compression makes the channels of a grey picture differ by at most
-_COLOURLESS_SHARE = 0.7  # a line that stands out in other channels this much has no colour to tell it by
+_COLOURLESS_SHARE = 0.85  # a line that stands out in other channels this much has no colour to tell it by
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
 _UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
 _MOSTLY = 0.75  # share of a run's rows
 _PURE = 0.45  # height in other channels of a line whose flanks must show its colour
 # A place's share may exceed the laser's by so much, and even where that makes it nearly white by the less.
-_BLEEDS, _WHITISH = (0.4, 0.15), 0.8
+_BLEEDS, _WHITISH = (0.4, 0.05), 0.8
 # By how much the laser's channel leads beside a saturated core, as a share of all light there and of the core's own:
 # white by the less, coloured by the more.
 _NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
-_FLANK = 15  # [grey levels] that a flank must rise by
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
-_HALF = 9  # [px] samples on either side of a line that its colour is measured from
-_SMEAR = 5  # [px] on either side of a line that its colour is smeared over
-_EDGE = 0.5  # height of an edge of brightness, over the line's, that its light cannot be told across
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
@@ -46,7 +43,7 @@ class _Colours(NamedTuple):
     own: F32  # height in the laser's channel [grey levels], at least 1
     other: F32  # in that of the others where it is highest
     saturated: Mask
-    near: F32  # see `_flank_lead`; 1 where not saturated
+    near: F32  # see `flank_lead`; 1 where not saturated
     beyond: F32
 
 
@@ -90,13 +87,13 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     """
     doubt = np.ones_like(candidates.snr)
     block, which = np.nonzero((candidates.snr > 3.0) & np.isnan(shares)[:, None])
-    if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * _HALF:
+    if not block.size or len(image) < BLOCK or image.shape[1] <= 2 * HALF:
         return doubt
     column, response = candidates.column[block, which], candidates.snr[block, which] * unit_of(noise, is_large(image))
     near_by = _colours(image, block, column, channel, 1)
     # What hardly rises so near by is a wide thing: it is asked on the scale it was found on too.
     broad = np.flatnonzero(near_by.own < _BROAD * response)
-    if image.shape[1] <= (2 * _HALF + 1) * _COARSE:
+    if image.shape[1] <= (2 * HALF + 1) * _COARSE:
         broad = broad[:0]
     coarse = _colours(image, block[broad], column[broad], channel, _COARSE)
     share = np.full(candidates.snr.shape, np.nan, np.float32)
@@ -120,9 +117,9 @@ def _colours(image: U8, block: Index, column: F32, channel: int, scale: int) -> 
     near, beyond = np.ones((2, len(block)), np.float32)
     at = np.flatnonzero(brightest[channel] >= COLOURLESS)
     if at.size:
-        near[at], beyond[at] = _flank_lead(profile[..., at], channel)
+        near[at], beyond[at] = flank_lead(profile[..., at], channel)
     if scale > 1:
-        profile = profile.reshape(2 * _HALF + 1, scale, 3, -1).mean(axis=1)
+        profile = profile.reshape(2 * HALF + 1, scale, 3, -1).mean(axis=1)
     height = light_added(profile, channel)
     own, other = np.maximum(height[channel], 1.0), np.maximum(height[channel - 1], height[channel - 2])
     return _Colours(own, other, brightest[channel] >= COLOURLESS, near, beyond)
@@ -159,7 +156,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
     """
     lost = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
-    if not row.size or image.shape[1] <= 2 * _HALF:
+    if not row.size or image.shape[1] <= 2 * HALF:
         return lost
     run = numbered(row, column[row], 1)
     doubtful = (np.bincount(run, pure[row]) < _MOSTLY * np.bincount(run))[run]
@@ -167,9 +164,9 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
         return lost
     row, run = row[doubtful], run[doubtful]
     middle = np.rint(column[row]).astype(np.intp)
-    y = _across(image, row, middle)
+    y = across(image, row, middle)
     height = light_added(y.astype(np.float32), channel)
-    clipped = y[_HALF, channel] >= COLOURLESS
+    clipped = y[HALF, channel] >= COLOURLESS
     by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
     lost[row] = _white_beside(image, row, middle, channel, clipped, run)
     stranger = _in_other_channels(by_run, np.bincount(run), channel)[run]
@@ -197,7 +194,7 @@ def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: M
     many = np.bincount(run, clipped) > 0.3 * np.bincount(run)
     at = np.flatnonzero(many[run] & clipped)
     if at.size:
-        leads = _flank_lead(_across(image, row[at], middle[at]).astype(np.float32), channel)
+        leads = flank_lead(across(image, row[at], middle[at]).astype(np.float32), channel, purer_side=True)
         seen = leads[0] < 1.0
         count = np.bincount(run[at], seen, minlength=len(many))
         near, beyond = (np.bincount(run[at], seen * lead, minlength=len(many)) for lead in leads)
@@ -212,94 +209,24 @@ def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) ->
     return in_other
 
 
-def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.int16]]:
-    """Heights (3, N) above their sides of N places of a picture (H, W, 3), by channel, and their middles' samples."""
-    y = _across(image, row, column)
-    core = y[_HALF - 2] + y[_HALF - 1] + y[_HALF] + y[_HALF + 1] + y[_HALF + 2]
-    side = y[0] + y[1] + y[-2] + y[-1]
-    return core * np.float32(0.2) - side * np.float32(0.25), y[_HALF]
-
-
-def light_added(y: F32, channel: int) -> F32:
-    """Light (3, N) by channel that N narrow places of profiles y (2 _HALF + 1, 3, N) add, a mean of five columns.
-
-    An edge of brightness looks like light of the room's colour. There it is asked again: how much light there is in the
-    laser's channel, of the columns next to the place; how far that leads the others, which an edge does not and which
-    cameras smear, over all columns it is smeared over.
-    """
-    left, right = 0.5 * (y[0] + y[1]), 0.5 * (y[-2] + y[-1])
-    side, middle = 0.5 * (left + right), y[_HALF - 2 : _HALF + 3].sum(axis=0)
-    added: F32 = 0.2 * middle - side
-    at = np.flatnonzero(np.abs(left[channel] - right[channel]) > _EDGE * added[channel])
-    if at.size:
-        y, side, middle = y[:, :, at], side[:, at], middle[:, at]
-        smeared = 0.2 * (y[_HALF - _SMEAR : _HALF + _SMEAR + 1].sum(axis=0) - (2 * _SMEAR + 1) * side)
-        near = middle[channel] + y[_HALF - 3, channel] + y[_HALF + 3, channel]
-        beside = y[[_HALF - 5, _HALF - 4, _HALF + 4, _HALF + 5], channel].sum(axis=0)
-        own = 0.2 * (near - 1.75 * beside)
-        again = smeared - smeared[channel] + own
-        share = [
-            np.maximum(h[channel - 1], h[channel - 2]) / np.maximum(h[channel], 1.0) for h in (again, added[:, at])
-        ]
-        better = at[share[0] < share[1]]
-        added[:, better] = again[:, share[0] < share[1]]
-    return added
-
-
-def _across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
-    """Samples (2 _HALF + 1, 3, N) around N places of a picture (H, W, 3)."""
-    length = 2 * _HALF + 1
-    x = np.clip(column, _HALF, image.shape[1] - 1 - _HALF)
-    runs = runs_at(image, row, 3 * (x - _HALF), 3 * length)
-    return np.asarray(cv2.transpose(runs), np.int16).reshape(length, 3, -1)
-
-
 def _profiles(image: U8, block: Index, column: F32, scale: int) -> tuple[F32, U8]:
-    """Mean profiles (scale (2 _HALF + 1), 3, N) of blocks' rows around N candidates, and their brightest cores (3, N).
+    """Mean profiles (scale (2 HALF + 1), 3, N) of blocks' rows around N candidates, and their brightest cores (3, N).
 
     Args:
         scale: how much wider than the narrowest.
     """
     height, width = image.shape[:2]
     row = np.minimum(block * BLOCK, height - BLOCK)
-    length = (2 * _HALF + 1) * scale
+    length = (2 * HALF + 1) * scale
     first = np.clip(np.rint(column).astype(np.intp) - length // 2, 0, width - length)
     runs = [runs_at(image, row + k, 3 * first, 3 * length) for k in range(BLOCK)]
     total, brightest = runs[0].astype(np.uint16), runs[0]
     for run in runs[1:]:
         total += run
         brightest = np.maximum(brightest, run)
-    core = brightest.reshape(-1, length, 3)[:, (_HALF - 2) * scale : (_HALF + 3) * scale].max(axis=1)
+    core = brightest.reshape(-1, length, 3)[:, (HALF - 2) * scale : (HALF + 3) * scale].max(axis=1)
     profile = (total * np.float32(1.0 / BLOCK)).reshape(-1, length, 3)
     return profile.transpose(1, 2, 0), core.T
-
-
-def _flank_lead(y: NDArray[np.floating], channel: int) -> tuple[F32, F32]:
-    """How far the laser's channel leads the others beside a saturated core, over how bright it is there (N,).
-
-    Args:
-        y: (n, 3, N) samples across the core.
-        channel: the laser's.
-
-    Returns:
-        the share of all the light there, and that of the light above the samples' ends; 1 where no flank is seen.
-    """
-    own, others, half = y[:, channel], (channel - 1, channel - 2), len(y) // 2
-    # Where one of the others is cut, the other tells.
-    clear = np.maximum(own, np.minimum(y[:, others[0]], y[:, others[1]])) < COLOURLESS
-    index, sides = np.arange(y.shape[2]), (slice(0, half), slice(half, None))
-    rises = [np.where(clear[side], own[side] - own[side].min(axis=0), 0.0) for side in sides]
-    left, right = rises[0].argmax(axis=0), rises[1].argmax(axis=0) + half
-    hidden = np.minimum(rises[0].max(axis=0), rises[1].max(axis=0)) < _FLANK
-    light = y[left, :, index] + y[right, :, index]
-    near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
-    # All of either side, for colour is smeared.
-    total = np.zeros((3, y.shape[2]), np.float32)
-    for side, ends in ((slice(2, half), [0, 1]), (slice(half, -2), [-2, -1])):
-        total += np.where(clear[side, None], y[side] - y[ends].mean(axis=0), 0.0).sum(axis=0)
-    beyond = np.clip(1.0 - total[list(others)].max(axis=0) / np.maximum(total[channel], 1.0), 0.0, 1.0)
-    beyond[total[channel] < _FLANK] = 0.0
-    return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
 
 
 def _laser_share(candidates: Candidates, share: F32, settled: F32) -> float | None:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import runs_in
-from scanmap.laserline.colour import heights_of
 from scanmap.laserline.path import JUMP
+from scanmap.laserline.shares import heights_of
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
