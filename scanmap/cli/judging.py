@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from scanmap.session.judging import Measured
     from scanmap.solvers.check import Check
     from scanmap.solvers.self_calibration import Refined
-    from scanmap.solvers.sight import Lines
 
 Recording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), a folder with scan.csv, or a video.")
@@ -53,7 +52,7 @@ def self_(
     _check_figure(figure)
     measured, is_twin = _measure(recording, config, set_, calibration)
     refined = refine(measured.lines, measured.calibration, None if scale == "auto" else scale)
-    _print_refined(refined, measured.lines)
+    _print_refined(refined)
     if figure is not None:
         from scanmap.solvers.wall_figures import draw_refined
 
@@ -143,7 +142,7 @@ def _measure(
     return measured, is_twin
 
 
-def _print_refined(refined: Refined, lines: Lines) -> None:
+def _print_refined(refined: Refined) -> None:
     from rich.table import Table
 
     from scanmap.cli.terminal import console, say
@@ -159,7 +158,7 @@ def _print_refined(refined: Refined, lines: Lines) -> None:
     walls = Table(padding=(0, 0), pad_edge=False)
     for name in ("wall", "range m", "length m", "rms before", "after mm", "bow before", "after mm"):
         walls.add_column(name, justify="right")
-    for k, (before, after) in enumerate(before_and_after(refined, lines), 1):
+    for k, (before, after) in enumerate(before_and_after(refined), 1):
         walls.add_row(
             str(k), f"{after.range_m:.2f}", f"{after.length_m:.2f}", f"{1e3 * before.rms_m:.2f}",
             f"{1e3 * after.rms_m:.2f}", f"{1e3 * before.bow_m:.2f}", f"{1e3 * after.bow_m:.2f}",

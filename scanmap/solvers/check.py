@@ -123,7 +123,7 @@ def check(lines: Lines, calibration: Calibration, params: CheckParams | None = N
             f"too little in this recording is flat to judge by ({len(segments)} pieces, {known} patches with a line): "
             "scan a room with bare walls; if this one has them, the calibration is far off: scanmap calibrate laser"
         )
-    walls, off = walls_under(calibration, lines, patches, segments, chosen, (noise, params))
+    walls, off = walls_under(calibration, patches, segments, chosen, (noise, params))
     return Check(
         walls, _corners(walls), compare_passes(lines, params.line_error_px), segments, patches, off, params,
         uncertainty_of(calibration), refined,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,28 +12,48 @@ from scanmap.solvers.flat_segments import FLOOR_M_PER_PX
 Array = NDArray[np.float64]
 
 
-def beside_own_planes(
-    points: Array, per_column: Array, own: Array, pieces: tuple[NDArray[np.intp], NDArray[np.intp], Array]
-) -> tuple[Array, Array]:
-    """Columns (N,) that points lie beside the planes fitted through each piece's own, and those planes' normals.
+class Pieces(NamedTuple):
+    """Which of K flat pieces each of N points lies on."""
+
+    piece: NDArray[np.intp]  # (N,) ascending
+    first: NDArray[np.intp]  # (K,) the first point of each
+    normals: Array  # (K, 3) about how they stand
+
+
+def beside_own_planes(points: Array, per_column: Array, own: Array, pieces: Pieces) -> tuple[Array, Array]:
+    """Columns (N,) that points lie beside the planes fitted through each piece's own, and those planes' normals (K, 3).
 
     Args:
+        points, per_column: (N, 3) as `located` gives them.
         own: weights (N,) of the points in the fits.
-        pieces: the piece (N,) each lies on, ascending; the first point (K,) of each; a normal (K, 3) to start from.
+        pieces: their normals are where the fits start, and the side on which the new ones are.
     """
     piece, first, normals = pieces
     points, per_column = np.nan_to_num(points), np.nan_to_num(per_column)
     for _ in range(2):
-        along = (per_column * normals[piece]).sum(axis=1)
-        weight = own / np.maximum(np.abs(along), FLOOR_M_PER_PX) ** 2
-        centre = np.add.reduceat(points * weight[:, None], first) / np.add.reduceat(weight, first)[:, None]
-        q = points - centre[piece]
+        weight = own / _steepness(per_column, normals[piece]) ** 2
+        q = points - _centres(points, weight, first)[piece]
         moments = np.add.reduceat(q[:, :, None] * q[:, None, :] * weight[:, None, None], first)
         normals = np.linalg.eigh(moments)[1][:, :, 0]
-    along = (per_column * normals[piece]).sum(axis=1)
-    steep = np.where(along >= 0, 1.0, -1.0) * np.maximum(np.abs(along), FLOOR_M_PER_PX)
-    off: Array = (q * normals[piece]).sum(axis=1) / steep
-    return off, normals
+    off: Array = (q * normals[piece]).sum(axis=1) / _steepness(per_column, normals[piece])
+    return off, normals * np.copysign(1.0, (normals * pieces.normals).sum(axis=1))[:, None]
+
+
+def azimuth_influence(points: Array, per_column: Array, own: Array, pieces: Pieces) -> Array:
+    """What an error of a column of each point (N,) does to its upright piece's azimuth [rad/px]."""
+    piece, first, normals = pieces
+    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column)
+    steep = _steepness(per_column, normals[piece])
+    q = points - _centres(points, own / steep**2, first)[piece]
+    across = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(first))], axis=1)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    up = np.cross(normals, across)
+    slope = np.stack([(q * across[piece]).sum(axis=1), (q * up[piece]).sum(axis=1), np.ones(len(q))], axis=1)
+    slope /= steep[:, None]
+    square = np.add.reduceat(slope[:, :, None] * slope[:, None, :] * own[:, None, None], first)
+    inverse = np.linalg.pinv(square, hermitian=True)
+    influence: Array = (inverse[piece, 0] * slope).sum(axis=1) * own
+    return influence
 
 
 def leans(wall: Array, floor: Array) -> Array:
@@ -49,3 +71,16 @@ def leans(wall: Array, floor: Array) -> Array:
     up = np.linalg.solve(rows.T @ rows + 0.01 * np.eye(2), rows.T @ lean)
     left: Array = lean - rows @ up
     return left
+
+
+def _steepness(per_column: Array, normal: Array) -> Array:
+    """(N,) how far a column moves each point along its normal [m/px], not less than what still tells something."""
+    along = (per_column * normal).sum(axis=1)
+    steep: Array = np.where(along >= 0, 1.0, -1.0) * np.maximum(np.abs(along), FLOOR_M_PER_PX)
+    return steep
+
+
+def _centres(points: Array, weight: Array, first: NDArray[np.intp]) -> Array:
+    """(K, 3) weighted means."""
+    centre: Array = np.add.reduceat(points * weight[:, None], first) / np.add.reduceat(weight, first)[:, None]
+    return centre

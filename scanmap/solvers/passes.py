@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.solvers.sight import Lines
+from scanmap.solvers.sight import SAME_BEARING, Lines
 
 
 class Passes(NamedTuple):
@@ -27,7 +27,7 @@ def compare_passes(lines: Lines, line_error_px: float) -> Passes | None:
     """
     turned = np.mod(lines.bearings - lines.bearings.min() + 1e-9, 2.0 * np.pi)
     order = np.argsort(turned, kind="stable")
-    close = np.flatnonzero(np.diff(turned[order]) < np.radians(0.02))
+    close = np.flatnonzero(np.diff(turned[order]) < SAME_BEARING)
     if len(close) < 3:
         return None
     first, second = order[close], order[close + 1]

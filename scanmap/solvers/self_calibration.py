@@ -4,8 +4,7 @@ Flat pieces of the scan are found with the head as it is, however bent; the head
 as well as it can; and again, with less tolerance, until only the line's own noise is left. Repeated bearings and the
 overlap of a full turn lie on the same pieces, so that passes must agree and the turn must close.
 
-Least squares over (laser plane, mount) with the planes eliminated (variable projection, Golub and Pereyra 1973),
-residuals in image columns, Cauchy weights, a ruler's knowledge as prior.
+In the end walls that seem to be meant square to each other are taken for it, as far as they bear it out.
 """
 
 from __future__ import annotations
@@ -19,23 +18,18 @@ from numpy.typing import NDArray
 from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import PLANE, Uncertainty, uncertainty_of
 from scanmap.errors import CalibrationError
+from scanmap.solvers.adjustment import Adjustment
 from scanmap.solvers.flat_segments import Segments, grow, near_another
 from scanmap.solvers.freedom import FREE, RULER, Scale, changed, longer_length, plane_slope, redrawn
-from scanmap.solvers.own_planes import beside_own_planes, leans
-from scanmap.solvers.sight import Lines, Patches, Sight, located, patches_of, sight_of
+from scanmap.solvers.sight import Lines, Patches, located, patches_of, sight_of
+from scanmap.solvers.squareness import Squared, squared
 
 Array = NDArray[np.float64]
 
 START_TOLERANCE_PX = 3.0
 ROUNDS = 6
-LARGEST_SOLVE = 15_000  # patches; more of one shot and wall say the same again
-NOISE_FLOOR_PX = 0.003  # of what all patches of one shot on one wall may have in common
-TYPICAL_SHOTS = 8  # shots on a piece from which on it tells its own noise
+REWEIGHTED = 4  # times, in the last round
 FEWEST_PIECES = 3
-# Walls stand upright and floors lie level to each other by so much [rad]; asked of the largest pieces only.
-PLUMB = np.radians(0.5)
-UPRIGHT_WITHIN = np.radians(12.0)
-LARGEST_PIECES = 12
 # A parameter is observed if the scan knows it at least this much better than the ruler.
 OBSERVED = 0.5
 # A head farther off than this many ruler's deviations is not refined but wrong.
@@ -64,13 +58,17 @@ class Refined:
     patches: Patches
     rms_before_px: float  # of the same pieces, in image columns
     rms_after_px: float
+    square: Squared  # what the walls' directions added
 
     def estimate(self, name: str) -> Estimate:
         """One of the parameters by its name."""
         return next(e for e in self.estimates if e.name == name)
 
 
-def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *, any_gain: bool = False) -> Refined:
+def refine(
+    lines: Lines, calibration: Calibration, scale: Scale | None = None, *, any_gain: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Refined:  # fmt: skip
     """Refine a head from the laser lines of one scan of a room, or of a block on a turntable.
 
     Args:
@@ -78,6 +76,7 @@ def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *
         calibration: the head as it is known; its intrinsics stay.
         scale: the length that holds the scale; the longer one if left out.
         any_gain: give the result even where the head was as good before.
+        progress: told after every round how many of how many are done.
 
     Raises:
         CalibrationError: the scan cannot tell (too few bearings or flat pieces, walls that leave it open), or what it
@@ -86,115 +85,30 @@ def refine(lines: Lines, calibration: Calibration, scale: Scale | None = None, *
     patches = patches_of(lines)
     if len(np.unique(np.round(patches.bearings, 3))) < 8:
         raise CalibrationError(
-            f"self-calibration needs a sweep; this recording has {len(patches.bearings)} shots. Scan half a turn at "
+            f"self-calibration needs a sweep; this recording has {len(lines.bearings)} shots. Scan half a turn at "
             "least, with walls in view"
         )
     scale = scale or longer_length(calibration)
     sight = sight_of(patches, calibration.intrinsics)
     free, ruler = FREE[scale], np.array([RULER[scale][name] for name in FREE[scale]])
     change, tolerance = np.zeros(len(free)), START_TOLERANCE_PX
-    for _ in range(ROUNDS):
+    for done in range(1, ROUNDS + 1):
         points, per_column = located(sight, changed(calibration, free, change))
         segments = grow(points, per_column, patches, tolerance)
-        if len(segments) < FEWEST_PIECES:
-            raise CalibrationError(
-                f"only {len(segments)} flat pieces found (3 at least): point the scanner at walls, floor and furniture "
-                "with flat faces, or calibrate with a board: scanmap calibrate laser"
-            )
         clear = ~near_another(points, per_column, segments, 2.0 * tolerance)
-        problem = _Problem.of(sight, (segments, clear), calibration, free, ruler)
-        change, covariance = problem.solve(change)
-        tolerance = max(0.5 * tolerance, min(5.0 * segments.noise_px, tolerance))
-    return _judged(_Outcome(calibration, scale, free, ruler, change, covariance), problem, segments, patches, any_gain)
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """The patches of one round, sorted by the piece they lie on."""
-
-    # Change (P,) and weights (N,) of the planes' fits -> (N,) [px], and leans (M,) in units of PLUMB.
-    residual: Callable[[Array, Array], tuple[Array, Array]]
-    piece: NDArray[np.intp]  # (N,) ascending
-    cluster: NDArray[np.intp]  # (N,) one shot on one piece: what may share an error
-    ruler: Array  # (P,)
-    weight: Array  # (N,) of the last solution
-
-    @classmethod
-    def of(
-        cls, sight: Sight, found: tuple[Segments, NDArray[np.bool_]], calibration: Calibration, free: tuple[str, ...],
-        ruler: Array,
-    ) -> _Problem:  # fmt: skip
-        segments, clear = found
-        where = np.flatnonzero(((segments.label >= 0) & clear).ravel())
-        where = where[:: max(1, len(where) // LARGEST_SOLVE)]
-        where = where[np.argsort(segments.label.ravel()[where], kind="stable")]
-        numbers, piece = np.unique(segments.label.ravel()[where], return_inverse=True)
-        shot = where // segments.label.shape[1]
-        _, cluster = np.unique(piece * segments.label.shape[0] + shot, return_inverse=True)
-        flat = Sight(*(part.reshape(-1, *part.shape[2:])[where] for part in sight))
-        first, normals = np.searchsorted(piece, np.arange(len(numbers))), segments.planes[numbers, :3]
-        large = np.argsort(-np.bincount(piece))[:LARGEST_PIECES]
-        lean = np.abs(normals[large, 2])
-        walls, floors = large[lean < np.sin(UPRIGHT_WITHIN)], large[lean > np.cos(UPRIGHT_WITHIN)]
-
-        def residual(change: Array, weight: Array) -> tuple[Array, Array]:
-            points, per_column = located(flat, changed(calibration, free, change))
-            off, now = beside_own_planes(points, per_column, weight, (piece, first, normals))
-            now = now * np.copysign(1.0, (now * normals).sum(axis=1))[:, None]
-            return off, leans(now[walls], now[floors]) / PLUMB
-
-        return cls(residual, piece, cluster, ruler, np.ones(len(piece)))
-
-    def solve(self, change: Array) -> tuple[Array, Array]:
-        """The best change (P,) and its covariance, reweighted three times."""
-        from scipy.optimize import least_squares
-
-        weight = np.ones(len(self.piece))
-        for _ in range(4):
-            off, lean = self.residual(change, weight)
-            weight = self._weights(off)
-            steady = 1.0 / np.sqrt(1.0 + (lean / 2.0) ** 2)
-
-            def weighed(x: Array, weight: Array = weight, steady: Array = steady) -> Array:
-                off, lean = self.residual(x, weight)
-                return np.concatenate([off * np.sqrt(weight), lean * steady, x / self.ruler])
-
-            solution = least_squares(weighed, change, x_scale=self.ruler, max_nfev=12)
-            change = solution.x
-        covariance: Array = np.linalg.inv(solution.jac.T @ solution.jac)
-        self.weight[:] = weight
-        return change, covariance
-
-    def _weights(self, off: Array) -> Array:
-        """Cauchy weights over the variance of each patch; what a shot's patches on one piece share counts once."""
-        whole = 1.4826 * np.median(np.abs(off))
-        scatter = np.array([1.4826 * np.median(np.abs(part)) for part in np.split(off, self._starts())])
-        own = np.maximum(scatter, max(0.3 * whole, NOISE_FLOOR_PX))[self.piece]
-        count = np.bincount(self.cluster)
-        shared = self._shared(np.bincount(self.cluster, off) / count, count)[self.cluster]
-        weight: Array = 1.0 / (1.0 + (off / (2.0 * own)) ** 2) / (own**2 + count[self.cluster] * shared**2)
-        return weight
-
-    def _shared(self, mean: Array, count: NDArray[np.intp]) -> Array:
-        """What the patches of one shot on one piece have in common, by the scatter of their means: (C,) [px].
-
-        Of each piece, as far as it has shots to tell; what it lacks comes from the others.
-        """
-        piece = np.zeros(len(mean), np.intp)
-        piece[self.cluster] = self.piece
-        several = count >= 5
-        squares = (1.4826 * np.abs(mean[several])) ** 2
-        typical = float(np.median(squares)) if several.any() else 0.0
-        found = [squares[piece[several] == k] for k in range(piece.max() + 1)]
-        own = np.array([
-            (len(s) * float(np.median(s) if len(s) else 0.0) + TYPICAL_SHOTS * typical) / (len(s) + TYPICAL_SHOTS)
-            for s in found
-        ])  # fmt: skip
-        shared: Array = np.sqrt(np.maximum(own, NOISE_FLOOR_PX**2))[piece]
-        return shared
-
-    def _starts(self) -> NDArray[np.intp]:
-        return np.flatnonzero(np.diff(self.piece)) + 1
+        adjustment = Adjustment.of(sight, patches, segments, clear, calibration, free, ruler)
+        if len(adjustment) < FEWEST_PIECES:
+            raise CalibrationError(
+                f"only {len(adjustment)} flat pieces found (3 at least): point the scanner at walls, floor and "
+                "furniture with flat faces, or calibrate with a board: scanmap calibrate laser"
+            )
+        solution = adjustment.solve(change, REWEIGHTED if done == ROUNDS else 2)
+        change, tolerance = solution.change, max(0.5 * tolerance, min(5.0 * segments.noise_px, tolerance))
+        if progress is not None:
+            progress(done, ROUNDS)
+    square = squared(adjustment.upright(solution), solution.covariance)
+    outcome = _Outcome(calibration, scale, free, ruler, change + square.change, square)
+    return _judged(outcome, (adjustment, solution.weight), segments, patches, any_gain)
 
 
 @dataclass(frozen=True)
@@ -206,10 +120,16 @@ class _Outcome:
     free: tuple[str, ...]
     ruler: Array
     change: Array
-    covariance: Array
+    square: Squared
+
+    @property
+    def covariance(self) -> Array:
+        return self.square.covariance
 
 
-def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: Patches, any_gain: bool) -> Refined:
+def _judged(
+    outcome: _Outcome, fit: tuple[Adjustment, Array], segments: Segments, patches: Patches, any_gain: bool
+) -> Refined:
     """The result, or why there is none."""
     sigma = np.sqrt(np.diag(outcome.covariance))
     estimates = tuple(
@@ -229,15 +149,16 @@ def _judged(outcome: _Outcome, problem: _Problem, segments: Segments, patches: P
             f"self-calibration would change {', '.join(far)} far more than a ruler errs: the head is not the one of "
             "this calibration, or the scan has hardly a flat wall. Calibrate with a board; nothing is written"
         )
-    before, after = (
-        _rms(problem.residual(x, problem.weight)[0]) for x in (np.zeros(len(outcome.change)), outcome.change)
-    )
+    before, after = (_rms(fit[0].residual(x, fit[1])[0]) for x in (np.zeros(len(outcome.change)), outcome.change))
     if not after <= before and not any_gain:
         raise CalibrationError(
             f"nothing to gain: flat pieces deviate by {before:.3f} px as it is and {after:.3f} px after; nothing is "
             "written"
         )
-    return Refined(outcome.calibration, _finished(outcome), outcome.scale, estimates, segments, patches, before, after)
+    return Refined(
+        outcome.calibration, _finished(outcome), outcome.scale, estimates, segments, patches, before, after,
+        outcome.square,
+    )  # fmt: skip
 
 
 def _finished(outcome: _Outcome) -> Calibration:

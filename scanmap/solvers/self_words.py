@@ -8,7 +8,6 @@ import numpy as np
 
 from scanmap.calibration import Calibration
 from scanmap.solvers.self_calibration import Estimate, Refined
-from scanmap.solvers.sight import Lines
 from scanmap.solvers.walls import CheckParams, Wall, walls_under
 
 SHOWN_WALLS = 6
@@ -68,13 +67,13 @@ def scale_words(refined: Refined) -> str:
     )
 
 
-def before_and_after(refined: Refined, lines: Lines) -> list[tuple[Wall, Wall]]:
+def before_and_after(refined: Refined) -> list[tuple[Wall, Wall]]:
     """The largest flat pieces under both calibrations."""
     sizes = np.bincount(refined.segments.label[refined.segments.label >= 0], minlength=len(refined.segments))
     chosen = [int(k) for k in np.argsort(-sizes)[:SHOWN_WALLS]]
     allowed = (refined.rms_after_px, CheckParams())
     both = [
-        walls_under(head, lines, refined.patches, refined.segments, chosen, allowed)[0]
+        walls_under(head, refined.patches, refined.segments, chosen, allowed)[0]
         for head in (refined.before, refined.after)
     ]
     return list(zip(*both, strict=True))

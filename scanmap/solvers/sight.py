@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration, Intrinsics
 from scanmap.laserline import LaserLine
+from scanmap.scan.range_image import bearing_columns
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -19,6 +20,8 @@ PATCHES = 300
 STRAIGHT_PX = 1.0
 # Rows along which the line runs off faster than this belong to a ledge [px a row].
 STEEPEST = 3.0
+# Bearings closer than this were meant to be the same [rad].
+SAME_BEARING = float(np.radians(0.02))
 
 
 class Lines(NamedTuple):
@@ -30,19 +33,17 @@ class Lines(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """A few rows of one shot each: B shots by ascending bearing within one turn, R patches from top to bottom."""
+    """A few rows of one bearing each: B bearings ascending within one turn, R patches from top to bottom."""
 
     column_px: Array  # (B, R) mean over the patch; NaN where it has too few rows or lies on an edge
     row_px: Array  # (B, R) its mean row
+    sigma_px: Array  # (B, R) mean sigma of its rows
     bearings: Array  # (B,) [rad]
-    order: NDArray[np.intp]  # (B,) the shot each came from
 
     @property
     def step(self) -> float:
-        """Median angle between bearings [rad], repeated ones left aside."""
-        steps = np.diff(self.bearings)
-        steps = steps[steps > np.radians(0.02)]
-        return float(np.median(steps)) if steps.size else 0.0
+        """Median angle between bearings [rad]."""
+        return float(np.median(np.diff(self.bearings))) if len(self.bearings) > 1 else 0.0
 
     @property
     def closed(self) -> bool:
@@ -83,14 +84,15 @@ class LineStore:
 
 
 def patches_of(lines: Lines) -> Patches:
-    """Straight pieces of the lines, a few rows each.
+    """Straight pieces of the lines, a few rows each; bearings that were seen again are one.
 
     A mean over rows leaves what neighbouring rows share: that they were pooled, and JPEG's blocks.
     """
+    lines = _merged(lines)
     shots, height = lines.column_px.shape
     rows = max(3, round(height / PATCHES))
     count = height // rows
-    column = lines.column_px[:, : count * rows].reshape(shots, count, rows)
+    column, sigma = (part[:, : count * rows].reshape(shots, count, rows) for part in lines[:2])
     row = np.arange(count * rows, dtype=np.float64).reshape(count, rows)
     known = np.isfinite(column)
     number = known.sum(axis=2)
@@ -102,11 +104,27 @@ def patches_of(lines: Lines) -> Patches:
     slope = (along * across).sum(axis=2) / np.maximum((along**2).sum(axis=2), 1e-9)
     bend = np.abs(across - slope[..., None] * along).max(axis=2)
     good = (number > rows / 2) & (number >= 2) & (bend < STRAIGHT_PX) & (np.abs(slope) < STEEPEST)
-    turned = np.mod(lines.bearings - lines.bearings.min() + 1e-9, 2.0 * np.pi) + lines.bearings.min()
-    order = np.argsort(turned, kind="stable")
     return Patches(
-        np.where(good, mean_column, np.nan)[order], np.where(good, mean_row, np.nan)[order], turned[order], order
-    )
+        np.where(good, mean_column, np.nan), np.where(good, mean_row, np.nan),
+        np.where(known, sigma, 0.0).sum(axis=2) / share, lines.bearings,
+    )  # fmt: skip
+
+
+def _merged(lines: Lines) -> Lines:
+    """Lines by ascending bearing within one turn; of repeated ones the mean, where they agree."""
+    bearings, groups = bearing_columns(lines.bearings, SAME_BEARING)
+    first = [group[0] for group in groups]
+    column, sigma = lines.column_px[first], lines.sigma_px[first]
+    for k, group in enumerate(groups):
+        if len(group) > 1:
+            known = np.isfinite(lines.column_px[group])
+            own = np.where(known, lines.column_px[group], 0.0)
+            share = np.maximum(known.sum(axis=0), 1)
+            mean = own.sum(axis=0) / share
+            agree = known.any(axis=0) & (np.where(known, np.abs(own - mean), 0.0).max(axis=0) < 0.5 * STRAIGHT_PX)
+            column[k] = np.where(agree, mean, np.nan)
+            sigma[k] = np.sqrt((np.where(known, lines.sigma_px[group], 0.0) ** 2).sum(axis=0)) / share
+    return Lines(column, sigma, np.array([bearings[group].mean() for group in groups]))
 
 
 def sight_of(patches: Patches, intrinsics: Intrinsics) -> Sight:

@@ -12,7 +12,7 @@ from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import moved, uncertainty_of
 from scanmap.solvers.budget import deviations
 from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, beside, fitted_plane
-from scanmap.solvers.sight import Lines, Patches, Sight, located, sight_of
+from scanmap.solvers.sight import Patches, Sight, located, sight_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -60,7 +60,6 @@ class Wall:
 
 def walls_under(
     calibration: Calibration,
-    lines: Lines,
     patches: Patches,
     segments: Segments,
     chosen: list[int],
@@ -77,7 +76,7 @@ def walls_under(
     """
     sight = sight_of(patches, calibration.intrinsics)
     points, per_column = located(sight, calibration)
-    sigma, spread = _patch_sigma(lines, patches), _Spread.of(calibration, sight)
+    spread = _Spread.of(calibration, sight)
     off = np.full(points.shape[:2], np.nan)
     walls = []
     for k in chosen:
@@ -85,7 +84,9 @@ def walls_under(
         plane = fitted_plane(points[member], per_column[member], segments.planes[k, :3])
         plane *= np.sign(plane[3]) or 1.0  # the normal toward the axis
         off[member] = beside(points[member], per_column[member], plane)
-        walls.append(_wall(points[member], per_column[member], plane, sigma[member], member, spread, allowed))
+        walls.append(
+            _wall(points[member], per_column[member], plane, patches.sigma_px[member], member, spread, allowed)
+        )
     return tuple(walls), off
 
 
@@ -183,13 +184,3 @@ def _without_plane(points: Array, height: Array, normal: Array) -> Array:
     A = np.column_stack([np.ones(len(points)), points - (points @ normal)[:, None] * normal])
     left: Array = height - A @ np.linalg.lstsq(A, height, rcond=None)[0]
     return left
-
-
-def _patch_sigma(lines: Lines, patches: Patches) -> Array:
-    """(B, R) median sigma of the rows of each patch [px]."""
-    shots, count = patches.column_px.shape
-    rows = lines.sigma_px.shape[1] // count
-    sigma = lines.sigma_px[patches.order, : count * rows].reshape(shots, count, rows)
-    known = np.isfinite(sigma)
-    total: Array = np.where(known, sigma, 0.0).sum(axis=2) / np.maximum(known.sum(axis=2), 1)
-    return total
