@@ -199,6 +199,35 @@ def test_a_limit_switch_in_mid_way_leaves_the_board_as_it_was_found(dialect: Dia
         assert board.memory.settings[1] == 40.0
 
 
+@pytest.mark.parametrize("dialect", ["grbl", "grblHAL"])
+def test_the_boards_own_soft_limits_end_in_words_and_without_light(dialect: DialectName) -> None:
+    board = Firmware(dialect=dialect)
+    board.memory.settings.update({1: 40.0, 22: 1, 20: 1})
+    board.power_cycle()
+    with plug(board) as url:  # by hand, so that all of machine space lies on the other side of zero
+        stage = open_grbl(StageParams(port=url, timeout_s=0.5))
+        stage.laser(True)
+        with pytest.raises(StageError, match=r"ALARM:2, the target lies outside .*\$20=0"):
+            stage.move_to(0.5)
+        stage.close()
+    assert not board.laser_on and board.memory.settings[1] == 40.0
+
+
+@pytest.mark.parametrize("dialect", ["grbl", "grblHAL", "FluidNC"])
+def test_a_head_homed_at_its_far_end_counts_from_there(dialect: DialectName) -> None:
+    board = Firmware(dialect=dialect, switch_deg=190.0, drivetrain=Drivetrain(bearing_deg=30.0))
+    board.memory.settings.update({22: 1, 23: 0, 20: 1})  # machine space from -199 to -1
+    board.power_cycle()
+    with plug(board) as url:
+        params = StageParams(port=url, homing="switch", home_deg=189.0, max_deg=189.0, timeout_s=0.5)
+        stage = open_grbl(params)
+        assert board.planner.position()[0] == -1.0
+        for deg in (180.0, 0.0, 90.0):
+            assert stage.move_to(math.radians(deg)) == pytest.approx(board.bearing, abs=1e-9)
+            assert math.degrees(board.bearing) == pytest.approx(deg, abs=1 / 80)
+        stage.close()
+
+
 def test_fluidnc_is_never_told_a_numbered_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     board, sent = Firmware(dialect="FluidNC", switch_deg=-3.0), bytearray()
     board.memory.settings.update({22: 1, 23: 1})

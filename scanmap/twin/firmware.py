@@ -21,7 +21,7 @@ from scanmap.twin.receiver import UART_BYTES
 from scanmap.twin.serial_line import Faults, SerialLine
 from scanmap.twin.status_report import status_line
 
-ALARM_S = {"grbl": 0.5, "grblHAL": 0.1, "FluidNC": 0.0}  # the processor waits so long for `ALARM:n` to get out
+ALARM_S = {"grbl": 0.5, "grblHAL": 0.1, "FluidNC": 0.5}  # the processor waits so long for `ALARM:n` to get out
 EEPROM_BYTE_S = 3.4e-3  # an AVR writes a byte of its memory so long, and hears nothing meanwhile
 
 _LEGACY = {ord("?"): 0x80, ord("~"): 0x81, ord("!"): 0x82}  # real-time commands and grblHAL's other names of them
