@@ -12,7 +12,7 @@ from scanmap.errors import CalibrationError
 from scanmap.geometry import rigid
 from scanmap.session.calibrating import BoardJob, solve_camera
 from scanmap.solvers.board import parse_board
-from scanmap.solvers.coverage import coverage_of, guidance, is_new
+from scanmap.solvers.coverage import coverage_of, is_new, progress_of
 from scanmap.solvers.detection import View, find_board
 from scanmap.solvers.intrinsics import calibrate_camera
 from scanmap.solvers.pictures import Picture, collect
@@ -89,11 +89,11 @@ def test_views_of_different_boards_are_refused() -> None:
 def test_guidance_asks_for_what_is_missing() -> None:
     rng = np.random.default_rng(6)
     left = [view_of(HEAD, BOARD, rigid(np.eye(3), [-0.35, rng.uniform(-0.2, 0.0), 0.6]), rng, 0.05) for _ in range(12)]
-    asked = guidance(left, BOARD, SIZE)
+    asked = progress_of(left, BOARD, SIZE).wishes
     assert "8 more views" in asked[0]
     assert any("tilt" in each for each in asked)
     assert any("right" in each for each in asked)
-    assert guidance(views(9, 30), BOARD, SIZE) == []
+    assert progress_of(views(9, 30), BOARD, SIZE).wishes == []
 
 
 def test_coverage_counts_corners_where_they_are() -> None:

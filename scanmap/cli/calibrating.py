@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,10 +15,8 @@ from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
 
 if TYPE_CHECKING:
     from scanmap.calibration import Calibration
-    from scanmap.cli.terminal import Stop
     from scanmap.session.calibrating import BoardJob, Solved
-    from scanmap.solvers.detection import Rejected, View
-    from scanmap.solvers.pictures import Views
+    from scanmap.view.board_live import BoardView
 
 calibrate = typer.Typer(
     name="calibrate",
@@ -46,10 +44,9 @@ FiguresOption = Annotated[
 RrdOption = Annotated[
     Path | None, typer.Option("--rrd", metavar="F.rrd", help="The check in space, for scanmap view F.rrd.")
 ]
-# Live: so many good views without a wish left are enough.
-LIVE_VIEWS = {"camera": 20, "laser": 15}
-SHOWN_REJECTED = 12
-LINE_EVERY_S = 5.0  # so much silence at most, while pictures of a folder are looked at
+ViewOption = Annotated[
+    bool, typer.Option("--view/--no-view", help="Live: serve picture, coverage and hints on 127.0.0.1 and show them.")
+]
 
 
 @calibrate.callback()
@@ -67,6 +64,7 @@ def camera(
     config: ConfigOption = None,
     set_: SetOption = None,
     calibration: CalibrationOption = None,
+    view: ViewOption = True,
 ) -> None:
     """Intrinsics and distortion from pictures of a board.
 
@@ -86,7 +84,7 @@ def camera(
         describe_fit(solved.fit, say)
         return solved
 
-    _run("camera", (source, board, config, set_), out, (figures, rrd), solve)
+    _run("camera", (source, board, config, set_), out, (figures, rrd), (base, view), solve)
 
 
 @calibrate.command()
@@ -106,6 +104,7 @@ def laser(
     rrd: RrdOption = None,
     config: ConfigOption = None,
     set_: SetOption = None,
+    view: ViewOption = True,
 ) -> None:
     """Laser plane from pictures of the board with the laser line on it.
 
@@ -114,15 +113,15 @@ def laser(
 
     Example: scanmap calibrate laser pictures/ --board chessboard:8x6:40mm --figures check
     """
-    from scanmap.cli.terminal import say, stop_on_signal
+    from scanmap.cli.terminal import say
     from scanmap.session import board_report
     from scanmap.session import calibrating as session
 
     base = _base(calibration, out, "scanmap calibrate camera SOURCE")
     margin_m = None if margin_mm is None else 1e-3 * margin_mm
     if check:
-        with stop_on_signal() as stop:
-            job = _job("laser", source, board, config, set_, stop)
+        with ExitStack() as opened:
+            job = _job("laser", (source, board, config, set_), base, view, opened)
             rms_m, rms_px, boards = session.check_laser(job, base, margin_m)
         say(f"passed: the line on {boards} boards lies {1e3 * rms_m:.2f} mm rms ({rms_px:.2f} px) off the laser plane")
         return
@@ -133,7 +132,7 @@ def laser(
             say(line)
         return solved
 
-    _run("laser", (source, board, config, set_), out, (figures, rrd), solve)
+    _run("laser", (source, board, config, set_), out, (figures, rrd), (base, view), solve)
 
 
 @calibrate.command()
@@ -146,6 +145,7 @@ def axis(
     rrd: RrdOption = None,
     config: ConfigOption = None,
     set_: SetOption = None,
+    view: ViewOption = True,
 ) -> None:
     """Head offset and tilt of the axis from a board that stands still while the head turns.
 
@@ -165,7 +165,7 @@ def axis(
             say(line)
         return solved
 
-    _run("axis", (source, board, config, set_), out, (figures, rrd), solve)
+    _run("axis", (source, board, config, set_), out, (figures, rrd), (base, view), solve)
 
 
 def _base(calibration: str | None, out: Path, before: str) -> Calibration:
@@ -182,48 +182,38 @@ def _base(calibration: str | None, out: Path, before: str) -> Calibration:
     return Calibration.load(path)
 
 
-def _job(part: str, source: str, board: str, config: str | None, set_: list[str] | None, stop: Stop) -> BoardJob:
+def _job(
+    part: str,
+    what: tuple[str, str, str | None, list[str] | None],
+    base: Calibration | None,
+    view: bool,
+    opened: ExitStack,
+) -> BoardJob:
+    """Where the pictures come from, with what is said of them; closed with `opened`."""
     from scanmap import config as configuration
     from scanmap.calibration.keeping import recorded_command
+    from scanmap.cli.collecting import Collecting
+    from scanmap.cli.terminal import stop_on_signal
     from scanmap.session.calibrating import BoardJob
     from scanmap.solvers.board import parse_board
 
-    asked = stop.orderly("stopping: the calibration is made of the views so far")
+    source, board, config, set_ = what
+    asked = opened.enter_context(stop_on_signal()).orderly("stopping: the calibration is made of the views so far")
     command = recorded_command(sys.argv[1:])
     job = BoardJob(source, parse_board(board), configuration.load(config, set_ or ()), command=command)
-    return replace(job, report=_reporter(part, asked, live=job.is_live))
+    shown = _live_view(part, job.config.view.live_port, opened) if view and job.is_live else None
+    return replace(job, report=Collecting(part, asked, live=job.is_live, base=base, view=shown))
 
 
-def _reporter(part: str, asked: Callable[[], bool], *, live: bool) -> Callable[[Views, View | Rejected], bool]:
-    """Says what is new; live, also what to show next. False ends the collection."""
+def _live_view(part: str, port: int, opened: ExitStack) -> BoardView:
+    from scanmap import session
     from scanmap.cli.terminal import say
-    from scanmap.solvers.coverage import guidance
-    from scanmap.solvers.detection import View
+    from scanmap.view.board_live import BoardView
 
-    said: list[str] = [""]
-    spoken = time.monotonic()
-
-    def report(views: Views, last: View | Rejected) -> bool:
-        nonlocal spoken
-        if asked():
-            return False
-        if not live and time.monotonic() - spoken > LINE_EVERY_S:
-            spoken = time.monotonic()
-            say(f"looked at {len(views.views) + len(views.rejected)} pictures, {len(views.views)} good")
-        if isinstance(last, View):
-            wanted = guidance(views.views, views.board, views.size) if live and part == "camera" else []
-            if live:
-                then = f"; next: {wanted[0]}" if wanted else ""
-                said[0] = f"{len(views.views)} good: {len(last.ids)} corners, edges {last.blur_px:.1f} px{then}"
-                say(said[0])
-            return not live or bool(wanted) or len(views.views) < LIVE_VIEWS.get(part, sys.maxsize)
-        if not live or last.reason != said[0]:
-            said[0] = last.reason
-            if live or len(views.rejected) <= SHOWN_REJECTED:
-                say(f"not used: {last.name}: {last.reason}")
-        return True
-
-    return report
+    shown = BoardView(port, coverage=part == "camera")
+    opened.callback(shown.close)
+    say(session.watching_words(port))
+    return shown
 
 
 def _run(
@@ -231,21 +221,23 @@ def _run(
     what: tuple[str, str, str | None, list[str] | None],
     out: Path,
     pictures: tuple[Path | None, Path | None],
+    live: tuple[Calibration | None, bool],
     solve: Callable[[BoardJob, Callable[[str], None]], Solved],
 ) -> None:
     """Collect, solve, say, write, draw."""
     from scanmap.calibration.keeping import parts_lost, refuse_file, refuse_folder, refuse_path
-    from scanmap.cli.terminal import say, stop_on_signal
+    from scanmap.cli.collecting import SHOWN_REJECTED
+    from scanmap.cli.terminal import say
     from scanmap.session import board_report
     from scanmap.session import calibrating as session
 
     figures, rrd = pictures
+    base, view = live
     refuse_path(out)
     refuse_folder("--figures", figures)
     refuse_file("--rrd", rrd, ".rrd")
-    with stop_on_signal() as stop:
-        job = _job(part, *what, stop)
-        solved = solve(job, say)
+    with ExitStack() as opened:
+        solved = solve(_job(part, what, base, view, opened), say)
     unsaid = solved.views.rejected[SHOWN_REJECTED:]
     if unsaid:
         say(f"not used: {len(unsaid)} more pictures")

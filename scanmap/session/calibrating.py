@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,21 +15,18 @@ from scanmap.calibration.file import R_HEAD_CAMERA_FORWARD
 from scanmap.calibration.gates import GATES
 from scanmap.calibration.keeping import existing, save_beside
 from scanmap.config import Config
-from scanmap.errors import CalibrationError, CameraError, ConfigError
+from scanmap.errors import CalibrationError
 from scanmap.geometry import rigid
-from scanmap.rig.camera import open_camera
-from scanmap.session.rigs import open_rig
-from scanmap.shot import Image, decode_image
+from scanmap.session.board_source import is_live, pictures_of_source, turning_pictures
+from scanmap.shot import Image
 from scanmap.solvers import laser_plane
 from scanmap.solvers.axis import AxisFit, calibrate_axis, with_axis
 from scanmap.solvers.board import Board
 from scanmap.solvers.board_line import BoardLine, find_board_line
 from scanmap.solvers.detection import Rejected, View
 from scanmap.solvers.intrinsics import calibrate_camera
-from scanmap.solvers.pictures import Picture, Views, collect, pictures_of, read_pictures
-from scanmap.sweep import sweep
+from scanmap.solvers.pictures import Picture, Views, collect
 
-LIVE = "camera"
 # A new residual this many times the old one is no improvement worth losing the old calibration's place for.
 WORSE_TIMES, WORSE_PX = 1.5, 0.1
 SHOWN_PICTURES = 6
@@ -59,12 +55,8 @@ class BoardJob:
 
     @property
     def is_live(self) -> bool:
-        """Whether a camera delivers the pictures; a folder or file of that name goes first."""
-        if not self.source.startswith("/dev/") and Path(self.source).exists():
-            return False
-        if self.source == LIVE or "://" in self.source:
-            return True
-        return self.source.startswith("/dev/") or self.source.isdecimal()
+        """Whether a camera delivers the pictures."""
+        return is_live(self.source)
 
 
 def solve_camera(job: BoardJob, base: Calibration | None) -> Solved:
@@ -74,7 +66,8 @@ def solve_camera(job: BoardJob, base: Calibration | None) -> Solved:
         CalibrationError: see `calibrate_camera`.
     """
     kept = _Kept()
-    views = collect(_pictures(job), job.board, use=kept.keep, distinct=True, report=job.report)
+    pictures = pictures_of_source(job.source, job.config)
+    views = collect(pictures, job.board, use=kept.keep, distinct=True, held=job.is_live, report=job.report)
     views.require()
     fit = calibrate_camera(views.views, job.board, views.size)
     views.rejected.extend(fit.rejected)
@@ -156,7 +149,8 @@ def solve_axis(job: BoardJob, base: Calibration) -> Solved:
             )
         return kept.keep(picture, view)
 
-    views = collect(_pictures(job, turning=True), job.board, use=use, report=job.report)
+    pictures = turning_pictures(job.source, job.config, base)
+    views = collect(pictures, job.board, use=use, report=job.report)
     views.require()
     base.check_image(*views.size)
     fit: AxisFit = calibrate_axis(views.views, job.board, base)
@@ -234,59 +228,17 @@ def _lines(job: BoardJob, base: Calibration, margin_m: float | None) -> tuple[li
         lines.append(found)
         return kept.keep(picture, view)
 
-    views = collect(_pictures(job, laser=True), job.board, use=use, report=job.report)
+    def report(views: Views, last: View | Rejected) -> bool:
+        of_last = lines[-1] if lines and isinstance(last, View) else None
+        views.line = np.stack([of_last.columns, of_last.rows], axis=-1) if of_last is not None else None
+        return job.report(views, last)
+
+    pictures = pictures_of_source(job.source, job.config, base, laser=True)
+    live = job.is_live
+    views = collect(pictures, job.board, use=use, distinct=live, held=live, report=report)
     if not lines and not any("laser" in each.reason for each in views.rejected):
         views.require()
     return lines, views, kept
-
-
-def _pictures(job: BoardJob, *, laser: bool = False, turning: bool = False) -> Iterator[Picture | Rejected]:
-    if not job.is_live:
-        return read_pictures(Path(job.source))
-    config = job.config
-    if job.source != LIVE:
-        source: int | str = int(job.source) if job.source.isdecimal() else job.source
-        config = config.model_copy(update={"camera": config.camera.model_copy(update={"source": source})})
-        if turning:
-            raise ConfigError("the axis needs a head that turns: SOURCE = camera with --config of your rig")
-    return _turning(config) if turning else _live(config, laser=laser and job.source == LIVE)
-
-
-def _turning(config: Config) -> Iterator[Picture | Rejected]:
-    if config.rig != "hardware":
-        raise ConfigError(
-            "the axis needs a head that turns: SOURCE = camera with --config of your rig (rig = 'hardware')"
-        )
-    opened = open_rig(config, config.head())
-    try:
-        yield from pictures_of(sweep(opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock))
-    finally:
-        opened.close()
-
-
-def _live(config: Config, *, laser: bool) -> Iterator[Picture | Rejected]:
-    """Pictures as the camera sends them, until nobody asks for more; the laser lit where the rig can."""
-    with ExitStack() as opened:
-        if laser and config.rig == "hardware":
-            rig = open_rig(config, config.head())
-            opened.callback(rig.close)
-            rig.rig.stage.laser(True)
-            camera = rig.rig.camera
-        else:
-            camera = open_camera(config.camera)
-            opened.callback(camera.close)
-        number = 0
-        while True:
-            try:
-                frame = camera.grab()
-            except CameraError as error:
-                if not number:
-                    raise
-                # What was collected before the camera went is not lost.
-                yield Rejected("the camera", f"{error}; going on with the pictures so far")
-                return
-            yield Picture(f"picture {number}", decode_image(frame.image).image)
-            number += 1
 
 
 def _meta(job: BoardJob, base: Calibration | None = None, **counts: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.calibration import Intrinsics
 from scanmap.solvers.board import Board
 from scanmap.solvers.board_pose import board_pose, rough_camera
 from scanmap.solvers.detection import View
@@ -18,8 +19,19 @@ VIEWS_LEAST, VIEWS_GOOD = 8, 20
 CELLS = (8, 6)  # of the picture, across and down
 COVERED_GOOD = 0.8  # [share of the cells]
 TILT_GOOD_DEG = 35.0
+LINES_GOOD = 15  # boards with the laser line on them
+DEPTHS_GOOD = 1.5  # farthest over nearest of these
 # [share of the image width] views whose corners differ by less on average are one view.
 NEW_SHARE = 0.005
+
+
+class Progress(NamedTuple):
+    """How far live views have come."""
+
+    covered: float  # share of the picture where corners were seen
+    tilt_deg: float  # spread of the boards' directions
+    depths_m: tuple[float, float]  # nearest and farthest board
+    wishes: list[str]  # what to show next, most needed first; empty when there is enough
 
 
 class Coverage(NamedTuple):
@@ -41,15 +53,23 @@ def coverage_of(views: Sequence[View], size: tuple[int, int]) -> Coverage:
     return Coverage(counts.astype(np.intp))
 
 
+def apart(view: View, other: View | None) -> float:
+    """Mean distance [px] of the corners that both views have; infinite where they have too few in common."""
+    if other is None:
+        return np.inf
+    both, here, there = np.intersect1d(view.ids, other.ids, return_indices=True)
+    if len(both) < 0.8 * len(view.ids):
+        return np.inf
+    off = float(np.linalg.norm(view.corners[here] - other.corners[there], axis=1).mean())
+    if np.isnan(view.marker_ratio) and len(view.ids) == len(other.ids):
+        # A chessboard may have been numbered the other way round this time.
+        off = min(off, float(np.linalg.norm(view.corners - other.corners[::-1], axis=1).mean()))
+    return off
+
+
 def is_new(view: View, before: Sequence[View], width: int) -> bool:
     """Whether a view shows something that none before it showed."""
-    for old in before:
-        both, here, there = np.intersect1d(view.ids, old.ids, return_indices=True)
-        if len(both) >= 0.8 * len(view.ids):
-            apart = np.linalg.norm(view.corners[here] - old.corners[there], axis=1).mean()
-            if apart < NEW_SHARE * width:
-                return False
-    return True
+    return all(apart(view, old) >= NEW_SHARE * width for old in before)
 
 
 def tilt_spread_deg(poses: Array) -> float:
@@ -73,11 +93,35 @@ def hints(views: Sequence[View], poses: Array, size: tuple[int, int]) -> list[st
     return wanted
 
 
-def guidance(views: Sequence[View], board: Board, size: tuple[int, int]) -> list[str]:
-    """`hints` before there is a camera: tilts are judged with an ordinary webcam's focal length."""
-    camera = rough_camera(size)
-    poses = [board_pose(view, board, camera).T_camera_board for view in views]
-    return hints(views, np.array([pose for pose in poses if np.isfinite(pose).all()]).reshape(-1, 4, 4), size)
+def progress_of(
+    views: Sequence[View], board: Board, size: tuple[int, int], camera: Intrinsics | None = None
+) -> Progress:
+    """How far live views have come, and what to show next.
+
+    Args:
+        camera: of the views, when they are for the laser; None before there is a camera: tilts are then judged with
+            an ordinary webcam's focal length.
+    """
+    poses = [board_pose(view, board, camera or rough_camera(size)).T_camera_board for view in views]
+    known = np.array([pose for pose in poses if np.isfinite(pose).all()]).reshape(-1, 4, 4)
+    wishes = hints(views, known, size) if camera is None else _laser_hints(views, known)
+    depths = known[:, 2, 3]
+    return Progress(
+        coverage_of(views, size).share, tilt_spread_deg(known),
+        (float(depths.min()), float(depths.max())) if len(depths) else (np.nan, np.nan), wishes,
+    )  # fmt: skip
+
+
+def _laser_hints(views: Sequence[View], poses: Array) -> list[str]:
+    wanted = []
+    if len(views) < LINES_GOOD:
+        wanted.append(f"{LINES_GOOD - len(views)} more views")
+    depths = poses[:, 2, 3]
+    if len(depths) and depths.max() < DEPTHS_GOOD * depths.min():
+        wanted.append("hold the board nearer and farther")
+    if tilt_spread_deg(poses) < TILT_GOOD_DEG:
+        wanted.append("turn the board both ways, 20 to 40 deg")
+    return wanted
 
 
 def _emptiest(coverage: Coverage) -> str:

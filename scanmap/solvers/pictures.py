@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from scanmap.errors import CalibrationError, CameraError, RecordingError
 from scanmap.recording import open_source
@@ -16,15 +17,19 @@ from scanmap.recording.frames import SUFFIXES
 from scanmap.recording.video import VIDEO_SUFFIXES
 from scanmap.shot import Image, Shot, decode_image
 from scanmap.solvers.board import Board
-from scanmap.solvers.coverage import is_new
+from scanmap.solvers.coverage import apart, is_new
 from scanmap.solvers.detection import Rejected, View, find_board
 from scanmap.solvers.other_boards import seen_instead, wrong_size
 
+Array = NDArray[np.float64]
+
 # Of a video without bearings this many pictures are taken, evenly.
 VIDEO_PICTURES = 120
-# [share] by which markers may measure larger or smaller against their squares than they should.
 PIXELS_MOST = 100_000_000  # looking for a board in more takes minutes
+# [share] by which markers may measure larger or smaller against their squares than they should.
 RATIO_MOST = 0.08
+# [share of the width] a board in somebody's hands may move between two pictures and count as held still.
+REST_SHARE = 0.002
 
 
 class Picture(NamedTuple):
@@ -45,6 +50,9 @@ class Views:
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     instead: str = ""  # what the first pictures without the board show in its place
+    picture: Picture | None = None  # the newest
+    line: Array | None = None  # (N, 2) column, row of the laser line in it [px]
+    before: View | None = None  # the board in the picture before it, if it was found there
 
     def require(self) -> None:
         """Raise CalibrationError where no picture shows the board at all; says what they show."""
@@ -121,6 +129,7 @@ def collect(
     *,
     use: Callable[[Picture, View], Rejected | None] = lambda picture, view: None,
     distinct: bool = False,
+    held: bool = False,
     report: Callable[[Views, View | Rejected], bool] = lambda views, last: True,
 ) -> Views:
     """Find the board in every picture.
@@ -128,11 +137,13 @@ def collect(
     Args:
         use: what else a picture is good for; gives a `Rejected` where it is good for nothing.
         distinct: leave out what shows no more than an earlier view did.
+        held: somebody holds the board before a running camera: a view counts once the board has come to rest.
         report: told of every picture; False ends it.
     """
     views = Views(board)
     for picture in pictures:
-        last = picture if isinstance(picture, Rejected) else _judged(picture, views, use, distinct)
+        views.picture = None if isinstance(picture, Rejected) else picture
+        last = picture if isinstance(picture, Rejected) else _judged(picture, views, use, distinct, held)
         if isinstance(last, View):
             views.views.append(last)
         else:
@@ -143,7 +154,7 @@ def collect(
 
 
 def _judged(
-    picture: Picture, views: Views, use: Callable[[Picture, View], Rejected | None], distinct: bool
+    picture: Picture, views: Views, use: Callable[[Picture, View], Rejected | None], distinct: bool, held: bool
 ) -> View | Rejected:
     height, width = picture.image.shape[:2]
     if height * width > PIXELS_MOST:
@@ -155,9 +166,14 @@ def _judged(
     seen = picture.image if picture.background is None else picture.background
     found = find_board(seen, views.board, picture.name, picture.bearing)
     if isinstance(found, Rejected):
+        views.before = None
         if not views.views and not views.instead and len(views.rejected) < 5:
             views.instead = seen_instead(seen, views.board)
         return found
+    moved_px = apart(found, views.before) if held else 0.0
+    views.before = found
+    if moved_px > REST_SHARE * width:
+        return Rejected(picture.name, "hold the board still")
     if distinct and not is_new(found, views.views, width):
         return Rejected(picture.name, "shows the same as an earlier view")
     return use(picture, found) or found
