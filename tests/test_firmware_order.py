@@ -7,7 +7,7 @@ import math
 import pytest
 from test_firmware import listen, say
 
-from scanmap.twin.board import decimal
+from scanmap.twin.board import DialectName, decimal
 from scanmap.twin.firmware import Firmware
 
 BANNER = "Grbl 1.1h ['$' for help]"
@@ -67,6 +67,17 @@ def test_grblhal_halted_by_an_alarm_answers_status_and_refuses_the_rest() -> Non
     assert say(board, b"?")[0].startswith("<Alarm|")
     assert [say(board, line) for line in ("M5", "$X", "")] == [["error:9"], ["error:79"], ["ok"]]
     assert say(board, b"\x18")[-1] == "[MSG:'$H'|'$X' to unlock]"
+
+
+@pytest.mark.parametrize(("dialect", "stays"), [("grbl", False), ("grblHAL", False), ("FluidNC", True)])
+def test_only_fluidnc_leaves_the_laser_on_in_an_alarm(dialect: DialectName, stays: bool) -> None:
+    board = Firmware(dialect=dialect)
+    say(board, "M3 S1000")
+    board.trip_limit()
+    listen(board)
+    assert board.laser_on is stays
+    say(board, b"\x18")
+    assert not board.laser_on
 
 
 def test_soft_limit_brakes_alarms_and_answers_after_the_reset(board: Firmware) -> None:

@@ -39,6 +39,8 @@ OF_GRBLHAL: dict[int, float] = {10: 511, 39: 1}  # what it reports; whether `?`,
 _THREE_DECIMALS = {11, 12, 24, 25, 27} | {number for number in _DEFAULTS if number >= 100}
 _WHOLE_OUTSIDE = {30, 31}  # kept as they are, told without decimals
 _FLAGS = {4, 5, 6, 13, 20, 21, 22, 32}
+ALARM_S = {"grbl": 0.5, "grblHAL": 0.1, "FluidNC": 0.5}  # the processor waits so long for `ALARM:n` to get out
+EEPROM_BYTE_S = 3.4e-3  # an AVR writes a byte of its memory so long, and hears nothing meanwhile
 HOMING, HOMING_ONE_AXIS, HOMING_FIRST = 1, 2, 4  # bits of $22; the last two are grblHAL's
 
 

@@ -13,16 +13,13 @@ import threading
 import time
 from dataclasses import dataclass, field
 
-from scanmap.twin.board import HOMING, HOMING_FIRST, OF_GRBLHAL, DialectName, Memory
+from scanmap.twin.board import ALARM_S, EEPROM_BYTE_S, HOMING, HOMING_FIRST, OF_GRBLHAL, DialectName, Memory
 from scanmap.twin.main_loop import MainLoop
 from scanmap.twin.motion import Drivetrain
 from scanmap.twin.planner import Planner
 from scanmap.twin.receiver import UART_BYTES
 from scanmap.twin.serial_line import Faults, SerialLine
 from scanmap.twin.status_report import status_line
-
-ALARM_S = {"grbl": 0.5, "grblHAL": 0.1, "FluidNC": 0.5}  # the processor waits so long for `ALARM:n` to get out
-EEPROM_BYTE_S = 3.4e-3  # an AVR writes a byte of its memory so long, and hears nothing meanwhile
 
 _LEGACY = {ord("?"): 0x80, ord("~"): 0x81, ord("!"): 0x82}  # real-time commands and grblHAL's other names of them
 _CRITICAL_ALARMS = {1, 2}  # these halt the board until it is reset
@@ -112,9 +109,10 @@ class Firmware:
             self._live()
 
     def raise_alarm(self, code: int) -> None:
-        """Stop dead, laser off, as grbl does on that alarm."""
+        """Stop dead, laser off, as on that alarm; FluidNC leaves it on (`off_on_alarm` is false) until the reset."""
         self.planner.abort(self._now)
-        self.loop.executor.spindle.stop()
+        if self.dialect != "FluidNC":
+            self.loop.executor.spindle.stop()
         self.alarm = True
         self.say(f"ALARM:{code}")
         self.work(ALARM_S[self.dialect])
