@@ -1,4 +1,4 @@
-"""ms per frame of every part, and replay against decoding alone, in one run.
+"""ms per frame of every part, and replay against decoding alone by our decoder and by OpenCV's, in one run.
 
     python benchmarks/pipeline.py [--frames 300] [--red-filter]
 
@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from scanmap.calibration import Calibration
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import find_laser_line
@@ -60,6 +64,40 @@ def cpu_ms(action: Callable[[int], object], repeats: int) -> float:
     return float(np.median(spent))
 
 
+class Spent(NamedTuple):
+    """What some work took [s]."""
+
+    wall: float
+    cpu: float  # of this process and of its workers, once they have ended
+
+
+def spent(work: Callable[[], object]) -> Spent:
+    """Do the work, say what it took."""
+
+    def cpu() -> float:
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return sum(one.ru_utime + one.ru_stime for one in used)
+
+    wall, before = time.perf_counter(), cpu()
+    work()
+    return Spent(time.perf_counter() - wall, cpu() - before)
+
+
+def decode_all(decode: Callable[[bytes], np.ndarray], jpegs: list[bytes], count: int) -> None:
+    """Only decode, in as many threads as there are cores: decoders leave the interpreter's lock."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for _ in pool.map(lambda k: decode(jpegs[k % DISTINCT])[0, 0], range(count)):
+            pass
+
+
+def record(path: Path, jpegs: list[bytes], count: int, head: Calibration) -> None:
+    """A recording of so many shots over half a turn."""
+    with Recorder(path, calibration=head, source="benchmark") as recorder:
+        for k in range(count):
+            bearing = float(np.radians(180.0 * k / count))
+            recorder.write(Shot(k, bearing, bearing, 0.1 * k, jpegs[k % DISTINCT]))
+
+
 def peak_mb(pid: int) -> float:
     """Largest resident memory of a process so far."""
     status = Path(f"/proc/{pid}/status").read_text()
@@ -72,54 +110,56 @@ def main() -> None:
     parser.add_argument("--red-filter", action="store_true", help="a camera behind a red filter: grey decode")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    settings = ['laserline.grey="luminance_601"'] if options.red_filter else []
-    config = load("twin-room", settings)
+    config = load("twin-room", ['laserline.grey="luminance_601"'] if options.red_filter else [])
     head = config.head()
     jpegs = frames(options.red_filter)
     pipeline = Pipeline(head, config.laserline, config.triangulation)
     grey = not pipeline.colour
+    planes = "grey" if grey else "BGR"
     print(f"{os.cpu_count()} cores, {DISTINCT} distinct JPEGs of {np.mean([len(j) for j in jpegs]) / 1e3:.0f} kB")
 
+    decoders: dict[str, Callable[[bytes], np.ndarray]] = {
+        "decoder": lambda jpeg: decode_image(jpeg, grey=grey).image,
+        "cv2.imdecode": lambda jpeg: cv2.imdecode(
+            np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
+        ),
+    }
     images = [decode_image(jpeg, grey=grey).image for jpeg in jpegs[:4]]
     lines = [find_laser_line(image, config.laserline, None, pipeline.window) for image in images]
-    for name, action in (
-        ("decode to grey", lambda k: decode_image(jpegs[k % DISTINCT], grey=True)),
-        ("decode to BGR", lambda k: decode_image(jpegs[k % DISTINCT])),
-        ("laser line, with window", lambda k: find_laser_line(images[k % 4], config.laserline, None, pipeline.window)),
-        ("triangulation", lambda k: triangulate(lines[k % 4], head, config.triangulation)),
-    ):
+    parts: dict[str, Callable[[int], object]] = {
+        f"{name} to {planes}": lambda k, decode=decode: decode(jpegs[k % DISTINCT]) for name, decode in decoders.items()
+    }
+    parts["laser line, with window"] = lambda k: find_laser_line(images[k % 4], config.laserline, None, pipeline.window)
+    parts["triangulation"] = lambda k: triangulate(lines[k % 4], head, config.triangulation)
+    for name, action in parts.items():
         print(f"{name:28s} {cpu_ms(action, 40):7.2f} ms CPU a frame")
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
-        with Recorder(path, calibration=head, source="benchmark") as recorder:
-            for k in range(options.frames):
-                bearing = float(np.radians(180.0 * k / options.frames))
-                recorder.write(Shot(k, bearing, bearing, 0.1 * k, jpegs[k % DISTINCT]))
-        workers = os.cpu_count() or 1
-        start = time.perf_counter()
-        with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(
-                lambda k: decode_image(jpegs[k % DISTINCT], grey=grey).image[0, 0], range(options.frames)
-            ):
-                pass
-        decode_s = time.perf_counter() - start
-        start = time.perf_counter()
+        record(path, jpegs, options.frames, head)
+        decoding = {
+            name: spent(partial(decode_all, decode, jpegs, options.frames)) for name, decode in decoders.items()
+        }
         scan = Scan(head.mount, HEIGHT)
-        with Processes(pipeline) as workers:  # their start counts
-            sinks = [lambda step: scan.add(step.profile, step.shot.bearing)]
-            workers.run(open_source(path).shots(), sinks)
-            worker_mb = [peak_mb(pid) for pid in workers.pids]
-        replay_s = time.perf_counter() - start
-        start = time.perf_counter()
-        clean = finished_scan(scan, config)
-        finish_s = time.perf_counter() - start
-        start = time.perf_counter()
-        OccupancyGrid.from_scan(clean, config.grid)
-        grid_s = time.perf_counter() - start
-    rate = options.frames / decode_s, options.frames / replay_s
-    print(f"decode only {rate[0]:.1f} frames/s, replay to Scan {rate[1]:.1f} frames/s, ratio {replay_s / decode_s:.2f}")
-    print(f"merge and filter {1e3 * finish_s:.0f} ms, grid {1e3 * grid_s:.0f} ms for {options.frames} bearings")
+        worker_mb = []
+
+        def replay() -> None:
+            with Processes(pipeline) as workers:  # their start counts
+                workers.run(open_source(path).shots(), [lambda step: scan.add(step.profile, step.shot.bearing)])
+                worker_mb.extend(peak_mb(pid) for pid in workers.pids)
+
+        replaying = spent(replay)
+    clean: list[Scan] = []
+    finish = spent(lambda: clean.append(finished_scan(scan, config)))
+    grid = spent(lambda: OccupancyGrid.from_scan(clean[0], config.grid))
+    print(f"{'':28s} frames/s  core-ms CPU a frame   replay over it: wall   CPU")
+    for name, only in (
+        *((f"only {name} to {planes}", only) for name, only in decoding.items()),
+        ("replay to Scan", replaying),
+    ):
+        ratios = "" if only is replaying else f"{replaying.wall / only.wall:27.2f} {replaying.cpu / only.cpu:5.2f}"
+        print(f"{name:28s} {options.frames / only.wall:8.1f} {1e3 * only.cpu / options.frames:20.2f}{ratios}")
+    print(f"merge and filter {1e3 * finish.wall:.0f} ms, grid {1e3 * grid.wall:.0f} ms for {options.frames} bearings")
     print(f"peak memory {peak_mb(os.getpid()):.0f} MB, of the workers {', '.join(f'{mb:.0f}' for mb in worker_mb)} MB")
 
 

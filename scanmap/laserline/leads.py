@@ -61,7 +61,7 @@ def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> F32:
     """The highest response (B,) of each block apart from the place `at` (B,) [grey levels]."""
     length = min(2 * max(int(_APART_PX) // scale, _CENTRE + 1) + 1, response.shape[1])
     runs = runs_in(response, length)
-    runs[np.arange(len(at)), np.clip(at - length // 2, 0, runs.shape[1] - 1)] = 0
+    runs[np.arange(len(at)), np.minimum(np.maximum(at - length // 2, 0), runs.shape[1] - 1)] = 0
     highest: F32 = response.max(axis=1) * np.float32(1.0 / (_CENTRE * scale))
     return highest
 
@@ -141,7 +141,7 @@ def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
             return response
     # In columns of the response, which lacks the picture's edge; only between the extremes do rows differ.
     ends = np.array([first.min(), first.max(), last.min(), last.max()]) / scale - _EDGE
-    left, inner_left, inner_right, right = np.clip(np.rint(ends), 0, width).astype(np.intp)
+    left, inner_left, inner_right, right = np.minimum(np.maximum(np.rint(ends), 0), width).astype(np.intp)
     response[:, :left] = 0
     response[:, right + 1 :] = 0
     for start, stop in ((left, inner_left + 1), (inner_right, right + 1)):

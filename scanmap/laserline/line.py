@@ -110,9 +110,9 @@ def find_laser_line(
         return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
     if not np.isfinite(window).any():
         return no_line(len(image), Reason.WINDOW)
-    # Everything below sees only the columns in question.
+    # Everything below sees only the columns in question; in fours, which are summed in pairs and those again.
     left = max(0, int(np.nanmin(window)) - _MARGIN) // 4 * 4
-    image = image[:, left : int(np.nanmax(window)) + _MARGIN + 1]
+    image = image[:, left : left + -(-(int(np.nanmax(window)) + _MARGIN + 1 - left) // 4) * 4]
     background = None if background is None else background[:, left : left + image.shape[1]]
     line = _found(image, params, background, window - left)
     line.column_px[:] += left
