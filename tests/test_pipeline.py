@@ -156,19 +156,29 @@ def processes(pipeline: Pipeline) -> Iterator[Processes]:
         yield workers
 
 
-def test_worker_processes_do_not_change_a_bit(pipeline: Pipeline, processes: Processes) -> None:
+@pytest.fixture
+def helped(pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch) -> Iterator[Processes]:
+    """One worker process, and this one, as on two cores."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with Processes(pipeline) as workers:
+        assert (len(workers.pids), workers.threads) == (1, 3)
+        yield workers
+
+
+def test_worker_processes_do_not_change_a_bit(pipeline: Pipeline, processes: Processes, helped: Processes) -> None:
     results = []
     source = [*shots(9, jpeg=True), Shot(9, 0.0, 0.0, 0.0, b"\xff\xd8\xff nothing")]
     for runner in (
         partial(run, process=pipeline.process, workers=1),
         partial(run, process=processes.process, workers=processes.threads),
         processes.run,
+        helped.run,
     ):
         steps: list[Step] = []
         assert runner(source, sinks=[steps.append], stop=lambda: False) == len(source)
         assert [step.shot for step in steps] == source
         results.append([(*(a.tobytes() for a in (*step.line, *step.profile)), step.fault) for step in steps])
-    assert results[0] == results[1] == results[2]
+    assert results[0] == results[1] == results[2] == results[3]
     assert "decoded" in results[1][-1][-1]
 
 
@@ -182,14 +192,17 @@ def test_what_a_worker_process_raises_is_raised_here(head: Calibration) -> None:
     assert str(there.value) == str(here.value)
 
 
-def test_steps_before_what_a_worker_process_raises_reach_the_sinks(pipeline: Pipeline, processes: Processes) -> None:
+def test_steps_before_what_a_worker_process_raises_reach_the_sinks(
+    pipeline: Pipeline, processes: Processes, helped: Processes
+) -> None:
     broken = Shot(4, 0.0, 0.0, 0.0, cast(bytes, None))
-    steps: list[Step] = []
     with pytest.raises(Exception) as here:
         pipeline.process(broken)
-    with pytest.raises(type(here.value)):
-        processes.run([*shots(4), broken, *shots(3)], [steps.append])
-    assert [step.shot.index for step in steps][:4] == list(range(4))
+    for workers in (processes, helped):
+        steps: list[Step] = []
+        with pytest.raises(type(here.value)):
+            workers.run([*shots(4), broken, *shots(3)], [steps.append])
+        assert [step.shot.index for step in steps][:4] == list(range(4))
 
 
 def test_source_that_fails_and_stop_end_the_worker_processes_run_too(processes: Processes) -> None:

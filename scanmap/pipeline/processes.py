@@ -34,6 +34,9 @@ WORTH_SHOTS = 100
 TOGETHER = 3
 # Messages on their way to one worker: it finds the next images waiting when it is done with some.
 IN_FLIGHT = 2
+# Reading shots and handing them to so many cores leaves this process time to work on some: it need not be started,
+# nor be sent anything. More cores than these keep it busy.
+_HELPS_CORES = 4
 # What a pipe should hold, where the system lets it: with its usual 64 kB either side waits for the other several times
 # a frame.
 _PIPE_BYTES = 1 << 20
@@ -75,11 +78,18 @@ class Processes:
     """
 
     def __init__(self, pipeline: Pipeline, count: int = 0) -> None:
-        """Start `count` workers; 0 takes one per processor core. They are ready when their first shot comes."""
+        """Start `count` workers, or for 0 as many as keep every core busy with this process, which helps on few cores.
+
+        They are ready when their first shot comes.
+        """
         self.pipeline = pipeline
-        self._workers = [_Worker(pipeline) for _ in range(count or os.cpu_count() or 1)]
-        self.threads = IN_FLIGHT * len(self._workers)
-        self._free: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+        cores = os.cpu_count() or 1
+        helps = not count and 1 < cores <= _HELPS_CORES
+        self._workers = [_Worker(pipeline) for _ in range(count or cores - helps)]
+        self.threads = IN_FLIGHT * len(self._workers) + helps
+        self._free: queue.SimpleQueue[_Worker | None] = queue.SimpleQueue()  # None: this process itself
+        if helps:
+            self._free.put(None)
         for _ in range(IN_FLIGHT):
             for worker in self._workers:
                 self._free.put(worker)
@@ -110,7 +120,7 @@ class Processes:
         """The steps of shots that whichever worker is free has processed; or what it raised, in the place of one."""
         worker = self._free.get()
         try:
-            answers = worker.ask(shots)
+            answers = worker.ask(shots) if worker else [_answer(self.pipeline, shot) for shot in shots]
         except (OSError, EOFError, pickle.UnpicklingError, ValueError) as gone:
             log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
             return iter([self.pipeline.process(shot) for shot in shots])
