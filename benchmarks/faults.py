@@ -1,6 +1,6 @@
 """Every fault at random moments of a scan: noticed when, what was lost, is the laser off, does a resumed scan equal?
 
-    python benchmarks/faults.py [--moments 20] [--homing hand|switch] [FAULT ...]
+    python benchmarks/faults.py [--moments 20] [--homing hand|switch] [--mode step|continuous] [FAULT ...]
 
 Small pictures, few bearings, a board in fast-forward; seeded. Writes the table of docs/reliability.md.
 """
@@ -23,17 +23,19 @@ import numpy as np
 
 from scanmap import session
 from scanmap.errors import CameraError, ScanmapError
-from scanmap.recording import open_source
+from scanmap.recording import describe, open_source
 from scanmap.scan.formats import read_ply
 from scanmap.session import preparing, rigs
 from scanmap.session.rigs import OpenRig, TwinDevices, open_rig
 from scanmap.shot import Shot
 from scanmap.sweep.matching import same_line, shift_between
+from scanmap.twin import TruthReport
 
 SETTINGS = (
     "calibration.image.width=320", "calibration.image.height=240", "sweep.step_deg=8", "sweep.end_deg=80",
     "sweep.off_frames=true", "stage.timeout_s=0.3", "recording.min_free_mb=0",
 )  # fmt: skip
+MODES = {"step": (), "continuous": ("sweep.mode='continuous'", "sweep.step_deg=2", "sweep.off_frames=false")}
 HOMING = {"hand": (), "switch": ("stage.homing='switch'", "twin.drive.switch_deg=-3.0", "stage.home_deg=-2")}
 
 
@@ -46,6 +48,7 @@ class Scene:
 
 
 Fault = Callable[[Scene], None]
+Settings = tuple[str, ...]
 
 
 def _no_camera(scene: Scene, times: int = 1 << 30) -> None:
@@ -135,8 +138,10 @@ class Tally:
         )
 
 
-def scan(folder: Path, homing: str, resume: Path | None = None, fault: Fault | None = None, moment: int = -1) -> Any:
-    """One scan; gives (result or None, error, writes to the board, shots recorded at the fault, laser shines)."""
+def scan(
+    folder: Path, settings: Settings, resume: Path | None = None, fault: Fault | None = None, moment: int = -1
+) -> Any:
+    """One scan: result or None, error, writes to the board, shots recorded at the fault, whether the laser shines."""
     writes, at_fault = [0], [-1]
     opened: list[OpenRig] = []
 
@@ -147,7 +152,7 @@ def scan(folder: Path, homing: str, resume: Path | None = None, fault: Fault | N
     preparing.open_rig = sabotaged  # type: ignore[assignment]
     record = None if resume is not None else folder / "a.mcap"
     outputs = session.Outputs((folder / ("b.ply" if resume else "a.ply"),), record=record)
-    choice = session.Choice() if resume is not None else session.Choice("twin-quick", (*SETTINGS, *HOMING[homing]))
+    choice = session.Choice() if resume is not None else session.Choice("twin-quick", settings)
     result, error = None, None
     try:
         with session.prepare_scan(choice, outputs, view=False, resume=resume) as job:
@@ -178,52 +183,71 @@ def is_elsewhere(shot: Shot, clean: Shot) -> bool:
     return not same_line(clean.image, shot.image) or (shift.is_sure and shift.is_proved)
 
 
-def is_same(cloud: Path, clean: Path) -> bool:
-    """Whether a scan has every bearing and, but for the noise of pictures taken again, the points of another."""
-    if not cloud.exists():
+def is_same(cloud: Path, clean: Path, truth: TruthReport | None, clean_truth: TruthReport) -> bool:
+    """Whether a scan has every bearing and, but for the noise of pictures taken again, the points of another.
+
+    A continuous sweep never meets the same bearings twice: it must be as complete, and as true to the room.
+    """
+    if not cloud.exists() or truth is None:
         return False
     one, other = read_ply(cloud), read_ply(clean)
     if not np.array_equal(one.bearings, other.bearings):
-        return False
+        all_there = bool((np.abs(one.bearings[:, None] - other.bearings).min(axis=0) < math.radians(1.0)).all())
+        return (
+            all_there
+            and truth.completeness > 0.98 * clean_truth.completeness
+            and truth.within_1cm > 0.98 * clean_truth.within_1cm
+            and truth.beyond_10cm < clean_truth.beyond_10cm + 0.01
+        )
     apart = np.abs(one.range_m - other.range_m) / np.hypot(one.sigma_m, other.sigma_m)
     both = one.valid & other.valid
     return bool(both.sum() > 0.97 * other.valid.sum() and (apart[both] < 6.0).mean() > 0.97)
 
 
-def campaign(name: str, homing: str, moments: int, clean: Path, writes: int, rng: np.random.Generator) -> Tally:
+@dataclass(frozen=True)
+class Clean:
+    """An undisturbed scan."""
+
+    folder: Path
+    settings: Settings
+    writes: int  # words to the board
+    truth: TruthReport
+
+
+def campaign(name: str, moments: int, clean: Clean, rng: np.random.Generator) -> Tally:
     """One fault at so many moments."""
-    whole = {shot.index: shot for shot in open_source(clean / "a.mcap").shots()}
+    whole = {shot.index: shot for shot in open_source(clean.folder / "a.mcap").shots()}
+    is_continuous = MODES["continuous"][0] in clean.settings
     tally = Tally()
-    for moment in rng.integers(1, writes + 1, moments):
+    for moment in rng.integers(1, clean.writes + 1, moments):
         with tempfile.TemporaryDirectory() as text:
             folder = Path(text)
-            result, error, _, at_fault, shining = scan(folder, homing, fault=FAULTS[name], moment=int(moment))
+            result, error, _, at_fault, shining = scan(folder, clean.settings, fault=FAULTS[name], moment=int(moment))
             if at_fault < 0:
                 continue
             tally.runs += 1
             tally.shining += shining
-            recording = folder / "a.mcap"
-            shots = list(open_source(recording).shots()) if recording.exists() else []
-            tally.wrong += sum(is_elsewhere(shot, whole[shot.index]) for shot in shots)
+            recording, cloud = folder / "a.mcap", folder / "a.ply"
+            recorded = describe(recording).shots if recording.exists() else 0
+            shots = list(open_source(recording).shots()) if recorded else []
+            if not is_continuous:
+                tally.wrong += sum(is_elsewhere(shot, whole[shot.index]) for shot in shots)
             if error is None:
                 tally.overcome += 1
-                assert result is not None
-                tally.lost += result.shots - len(shots)
-                tally.equal += is_same(folder / "a.ply", clean / "a.ply")
-                continue
-            tally.words.add(str(error))
-            tally.after.append(len(shots) - at_fault)
-            tally.lost += max(0, at_fault - len(shots))
-            again = folder / "b.ply"
-            if not shots:
-                recording.unlink(missing_ok=True)
-                _, error, *_ = scan(folder, homing)
-                again = folder / "a.ply"
-            elif len(shots) == len(whole):
-                again = folder / "a.ply"
             else:
-                _, error, *_ = scan(folder, homing, resume=recording)
-            tally.equal += is_same(again, clean / "a.ply")
+                tally.words.add(str(error))
+                tally.after.append(recorded - at_fault)
+            tally.lost += max(0, (result.shots if result is not None else at_fault) - recorded)
+            if not recorded:
+                recording.unlink(missing_ok=True)
+                result, error, *_ = scan(folder, clean.settings)
+            elif error is not None and {shot.index for shot in shots} < whole.keys():
+                cloud = folder / "b.ply"
+                result, error, *_ = scan(folder, clean.settings, resume=recording)
+            same = is_same(cloud, clean.folder / "a.ply", result.truth if result else None, clean.truth)
+            tally.equal += same
+            if not same:
+                tally.words.add(f"UNEQUAL: moment {moment}: {error}")
     return tally
 
 
@@ -232,6 +256,7 @@ def main() -> None:
     parser.add_argument("faults", nargs="*", metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--moments", type=int, default=20)
     parser.add_argument("--homing", choices=list(HOMING), default="hand")
+    parser.add_argument("--mode", choices=list(MODES), default="step")
     parser.add_argument("--words", action="store_true", help="print every message")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
@@ -239,12 +264,13 @@ def main() -> None:
     print("| fault | overcome / stopped | noticed after (shots) | lost | wrong | laser off | equal |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as text:
-        clean = Path(text)
-        _, error, writes, *_ = scan(clean, options.homing)
+        settings = (*SETTINGS, *MODES[options.mode], *HOMING[options.homing])
+        result, error, writes, *_ = scan(Path(text), settings)
         assert error is None, error
+        clean = Clean(Path(text), settings, writes, result.truth)
         for name in options.faults or FAULTS:
             rng = np.random.default_rng(sum(map(ord, name)))
-            tally = campaign(name, options.homing, options.moments, clean, writes, rng)
+            tally = campaign(name, options.moments, clean, rng)
             print(tally.row(name), flush=True)
             for words in sorted(tally.words) if options.words else ():
                 print("    ", words)

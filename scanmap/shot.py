@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import zlib
 from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 import cv2
@@ -37,6 +38,13 @@ class Shot:
     time: float  # [s] since the scan began; for recordings of others, since their epoch
     image: bytes  # encoded (JPEG or PNG), laser on
     background: bytes | None = None  # encoded, laser off, same bearing
+
+
+class Withdrawal(Enum):
+    """Why a sweep takes back shots that it had handed out."""
+
+    PLACE = "place"  # the head may not have stood where they say
+    LINE = "line"  # the laser was out
 
 
 class Decoded(NamedTuple):

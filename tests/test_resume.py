@@ -12,7 +12,7 @@ import pytest
 from scanmap import config as configuration
 from scanmap import session
 from scanmap.errors import ConfigError, ScanmapError, StageError
-from scanmap.recording import describe, open_source
+from scanmap.recording import RecordingParams, describe, open_source
 from scanmap.session import preparing
 from scanmap.session.rigs import OpenRig, open_rig
 
@@ -158,11 +158,6 @@ REFUSED: list[tuple[Callable[[Path], Path], tuple[str, ...], str]] = [
     (lambda folder: scan(folder, "sweep.mode='adaptive'", "sweep.step_deg=90", "sweep.fine_deg=45"), (), "is complete"),
     (lambda folder: scan(folder, shots=3), ("sweep.step_deg=5",), "goes on with the settings it began with"),
     (lambda folder: folder / "nothing.mcap", (), "not the recording"),
-    (
-        lambda folder: scan(folder, "sweep.mode='continuous'", "sweep.step_deg=2", "sweep.end_deg=20", shots=5),
-        (),
-        "continuous sweep",
-    ),
     (lambda folder: scan(folder, shots=3).rename(folder / "a.part2.mcap"), (), "the file that the scan began in"),
 ]
 
@@ -176,6 +171,92 @@ def test_what_cannot_be_gone_on_with_is_refused_and_leaves_nothing(
     with pytest.raises(ConfigError, match=words):
         resume(recording, *settings)
     assert sorted(tmp_path.iterdir()) == there
+
+
+CONTINUOUS = ("sweep.mode='continuous'", "sweep.step_deg=2", "sweep.end_deg=30", "sweep.passes=2")
+
+
+def test_a_continuous_sweep_goes_on_where_it_was_left(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    whole = scan(tmp_path / "whole", *CONTINUOUS)
+    first = scan(tmp_path, *CONTINUOUS, shots=20)
+    there = [shot.index for shot in open_source(first).shots()]
+    job = resume(first)
+    assert any("was recognised" in line for line in job.announcement)
+    source = open_source(first)
+    ours, theirs = list(source.shots()), list(open_source(whole).shots())
+    assert [shot.index for shot in ours] == [shot.index for shot in theirs] and len(there) < len(ours)
+    for shot, clean in zip(ours, theirs, strict=True):
+        assert abs(shot.bearing - clean.bearing) < math.radians(0.2 + 0.02)  # a picture later, a little off
+    with pytest.raises(ConfigError, match="is complete"):
+        resume(first)
+
+
+def test_shots_of_a_head_that_lost_its_place_are_taken_back_and_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps that are lost a few at a time show only when the head is back where it began."""
+    (tmp_path / "whole").mkdir()
+    settings = ("sweep.step_deg=3", "sweep.end_deg=30")
+    scan(tmp_path / "whole", *settings)
+
+    def open_slipping(*words: Any) -> OpenRig:
+        opened = open_rig(*words)
+        assert opened.twin is not None
+        drive = opened.twin.firmware.drivetrain
+        follow = drive.follow
+
+        def slipping(steps: int) -> None:
+            forward = steps - drive._counted
+            follow(steps)
+            if forward > 0:
+                drive.slip(round(0.15 * forward))
+
+        drive.follow = slipping  # type: ignore[method-assign]
+        return opened
+
+    monkeypatch.setattr(preparing, "open_rig", open_slipping)
+    outputs = session.Outputs((tmp_path / "a.ply",), record=tmp_path / "a.mcap")
+    with session.prepare_scan(session.Choice("twin-quick", (*QUICK, *settings)), outputs, view=False) as job:
+        result = job.run(lambda _: None, lambda: False)
+    assert "10 shots cannot be trusted and are left out" in str(result.error) and len(result.scan) == 1
+    monkeypatch.undo()
+    first = tmp_path / "a.mcap"
+    assert describe(first).shots == 11
+    assert any("10 shots withdrawn" in line and line.endswith("1 to 10") for line in describe(first).lines)
+    source = open_source(first)
+    assert [shot.index for shot in source.shots()] == [0] and source.count == 1
+    assert any("10 shots that the sweep took back are left out" in fault for fault in source.faults)
+    all_of_them = open_source(first, RecordingParams(withdrawn="keep"))
+    assert len(list(all_of_them.shots())) == 11
+    resume(first)
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "whole" / "a.ply").read_bytes()
+    assert replayed(first, "c.ply") == (tmp_path / "b.ply").read_bytes()
+    lines = session.recover(first)
+    assert lines[0].startswith(f"wrote {tmp_path / 'a.whole.mcap'}: 11 shots")
+    assert replayed(tmp_path / "a.whole.mcap", "d.ply") == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_scan_without_a_laser_is_gone_on_with_by_its_pictures_of_the_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "whole").mkdir()
+    scan(tmp_path / "whole", "sweep.off_frames=true")
+
+    def open_dead(*words: Any) -> OpenRig:
+        opened = open_rig(*words)
+        assert opened.twin is not None
+        opened.twin.firmware.laser_dead = True
+        return opened
+
+    monkeypatch.setattr(preparing, "open_rig", open_dead)
+    first = scan(tmp_path, "sweep.off_frames=true")
+    monkeypatch.undo()
+    assert list(open_source(first).shots()) == []
+    job = resume(first)
+    assert any("was recognised" in line for line in job.announcement)
+    whole = open_source(tmp_path / "whole" / "a.mcap")
+    assert [shot.bearing for shot in open_source(first).shots()] == [shot.bearing for shot in whole.shots()]
 
 
 def test_a_bag_of_others_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

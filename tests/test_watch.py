@@ -66,7 +66,9 @@ def run(*settings: str, fault: Fault | None = None, after: int = 5) -> tuple[lis
     wrong = 0.0
     try:
         watch = watch_of(config, config.head())
-        for shot in sweep(opened.rig, config.sweep, sleep=opened.sleep, watch=watch, note=notes.append):
+        for shot in sweep(
+            opened.rig, config.sweep, sleep=opened.sleep, clock=opened.clock, watch=watch, note=notes.append
+        ):
             shots.append(shot)
             off = math.degrees(shot.bearing) - opened.twin.firmware.drivetrain.bearing_deg
             wrong = max(wrong, abs(off) if not notes else 0.0)
@@ -133,10 +135,12 @@ def test_a_stalled_motor_is_not_homed_for_ever() -> None:
     assert len(shots) == 5 and len(notes) == 2 and "motor stalled" in ended
 
 
-def test_a_motor_that_stalls_where_the_room_is_plain_is_noticed_at_the_end() -> None:
-    """There no picture differs from the next; but from there the head does not come back either."""
-    shots, _, ended, _ = run("sweep.end_deg=80", "sweep.step_deg=8", "sweep.off_frames=true", fault=stall, after=9)
-    assert len(shots) == 11 and "it still shows what it saw last, the motor stalled" in ended
+@pytest.mark.parametrize("room", [(), ("twin.room='box'",), ("twin.light.ambient=0.0",)], ids=str)
+def test_a_motor_that_stalls_where_the_room_is_plain_or_dark_is_noticed_at_once(room: tuple[str, ...]) -> None:
+    """No picture can be matched there, but two of one place differ by nothing but noise."""
+    settings = ("sweep.end_deg=80", "sweep.step_deg=8", "sweep.off_frames=true")
+    shots, _, ended, _ = run(*settings, *room, fault=stall, after=9)
+    assert len(shots) == 9 and "motor stalled: the picture does not change, however far" in ended
 
 
 def test_steps_lost_too_few_at_a_time_are_noticed_at_the_end() -> None:
@@ -183,3 +187,33 @@ def test_a_loose_contact_of_the_laser_costs_no_shot() -> None:
     assert lit is not None
     for shot, clean in zip(shots, whole, strict=True):
         assert lit(shot.image, None) == pytest.approx(lit(clean.image, None), abs=0.2)
+
+
+CONTINUOUS = ("sweep.mode='continuous'", "sweep.step_deg=2")
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (slip, r"steps were lost .* head off by about -(0\.[789]|1\.[012])\d* deg"),
+        (stall, "steps were lost or the motor stalled"),
+        (laser_out, "laser has gone out: no line at 8"),
+        (brown_out, "restarted by itself"),
+    ],
+)
+def test_a_continuous_sweep_is_watched_as_well(fault: Fault, words: str) -> None:
+    shots, _, ended, wrong = run(*CONTINUOUS, fault=fault)
+    assert [shot.index for shot in shots] == [0, 1, 2, 3, 4] and wrong < 0.01
+    assert re.search(words, ended), ended
+
+
+def test_a_continuous_sweep_homes_again_and_misses_no_slot() -> None:
+    shots, notes, ended, _ = run(*CONTINUOUS, *SWITCH, "twin.latency_s=0.08", "twin.jitter_s=0.002", fault=slip)
+    assert ended == "done" and len(notes) == 1 and "homed again" in notes[0]
+    assert sorted({shot.index for shot in shots}) == list(range(18))
+
+
+def test_a_continuous_sweep_without_a_fault_raises_none_however_late_its_pictures_come() -> None:
+    shots, notes, ended, _ = run(*CONTINUOUS, "sweep.passes=2", "twin.latency_s=0.08", "twin.jitter_s=0.002")
+    assert (notes, ended) == ([], "done")
+    assert len(shots) == len({shot.index for shot in shots}) > 34

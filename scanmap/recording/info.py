@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scanmap.recording import layout, mcap_records, messages
+from scanmap.recording import layout
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_reader import bag_parts
-from scanmap.recording.mcap_records import DamagedError
-from scanmap.recording.messages import SECOND_NS, Fault, MalformedMessageError
+from scanmap.recording.messages import SECOND_NS, Fault
 from scanmap.recording.opening import open_source
 from scanmap.recording.outline import Outline, outline
 from scanmap.recording.parts import part_outlines
+from scanmap.recording.withdrawals import noted_faults, ranges, withdrawn_indices
 
 
 class TopicInfo(NamedTuple):
@@ -66,7 +66,10 @@ class RecordingInfo:
         lines += [f"plan {key}: {value}" for key, value in self.plan.items()]
         lines += [f"{key}: {value}" for key, value in self.versions.items()]
         lines += [f"topic {name}: {topic.messages} {topic.message_type}" for name, topic in self.topics.items()]
-        return lines + [f"fault noted by the {fault.part}: {fault.message}" for fault in self.faults]
+        for fault in self.faults:
+            which = f": {ranges(shots)}" if (shots := withdrawn_indices(fault)) else ""
+            lines.append(f"fault noted by the {fault.part}: {fault.message}{which}")
+        return lines
 
     @property
     def _ended(self) -> str:
@@ -122,7 +125,7 @@ def _describe_parts(path: Path, parts: list[Outline], params: RecordingParams) -
         topics=dict(sorted(topics.items())),
         has_calibration=layout.CALIBRATION_ATTACHMENT in first.attachments,
         has_rig=layout.RIG_ATTACHMENT in first.attachments,
-        faults=tuple(fault for part in parts for fault in _faults(part)),
+        faults=tuple(fault for part in parts for _, fault in noted_faults(part)),
     )
 
 
@@ -143,21 +146,3 @@ def _plan(text: str) -> dict[str, Any]:
     except ValueError:
         return {"plan": text}
     return plan if isinstance(plan, dict) else {"plan": plan}
-
-
-def _faults(part: Outline) -> list[Fault]:
-    """Warnings and errors on the diagnostics topics."""
-    found: list[Fault] = []
-    with mcap_records.open_mcap(part.path) as file:
-        for chunk in part.diagnostics:
-            try:
-                for opcode, view in mcap_records.chunk_records(mcap_records.body(file, chunk)):
-                    if opcode != mcap_records.MESSAGE:
-                        continue
-                    message = mcap_records.message(view)
-                    channel = part.directory.channels.get(message.channel_id)
-                    if channel is not None and channel.message_type == layout.DIAGNOSTIC_ARRAY:
-                        found += messages.read_faults(message.data)
-            except (DamagedError, MalformedMessageError):
-                continue  # the reading of the shots says so
-    return [fault for fault in found if fault.level > 0]

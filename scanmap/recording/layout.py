@@ -5,14 +5,24 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
+from typing import Literal
 
 from pydantic import BaseModel, Field
+
+from scanmap.shot import Withdrawal
 
 CALIBRATION_ATTACHMENT = "calibration.toml"
 RIG_ATTACHMENT = "rig.toml"
 START_METADATA = "scanmap"  # written first: versions, source, plan, start_ns
 END_METADATA = "end"  # written last: reason, shots
 METADATA_CRC = "crc32"  # the format guards messages and attachments by a CRC, but not metadata
+
+# Details of a diagnostics status that takes shots back which stand before it, in this part or an earlier one.
+WITHDRAWN_DETAIL, WITHDRAWN_WHY_DETAIL = "withdrawn_shots", "withdrawn_why"
+WITHDRAWN_WORDS = {
+    Withdrawal.PLACE: "the head may not have stood where they say",
+    Withdrawal.LINE: "the laser was out",
+}
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -41,6 +51,11 @@ class RecordingParams(BaseModel, frozen=True, extra="forbid"):
         "head_commanded", min_length=1, description="joint with the commanded bearing; may be absent"
     )
     max_gap_s: float = Field(0.5, gt=0, le=60, description="longest gap between two bearings to interpolate across [s]")
+    withdrawn: Literal["leave-out", "keep-unlit", "keep"] = Field(
+        "leave-out",
+        description="replay, of shots that the sweep took back: none; those with the laser out; also those whose "
+        "bearing is doubtful",
+    )
     min_free_mb: float = Field(200.0, ge=0, description="a scan stops before the disk has less free than this [MB]")
     fsync_s: float = Field(1.0, ge=0, le=60, description="force what is recorded to the disk at most this often [s]")
 

@@ -15,6 +15,7 @@ from scanmap.recording.messages import MalformedMessageError
 from scanmap.recording.outline import Outline, outline
 from scanmap.recording.parts import part_outlines
 from scanmap.recording.source import Report, Source
+from scanmap.recording.withdrawals import Withdrawals, left_out, withdrawals
 from scanmap.shot import Shot
 
 
@@ -31,14 +32,16 @@ def mcap_source(path: Path, params: RecordingParams) -> Source:
     cut = any(found.cut for found in outlines) if path.is_dir() else last.cut
     end = last.metadata.get(layout.END_METADATA, {})
     counts = [found.count(params.image_topic) for found in outlines]
+    own = first.metadata.get(layout.START_METADATA, {}).get("start_ns", "").isdecimal()
+    notes = withdrawals(outlines) if own else []
     return Source(
         path=path,
         kind="recording",
-        read=lambda report: _read(outlines, params, report),
+        read=lambda report: _read(outlines, params, Withdrawals(notes, params), report),
         calibration_toml=first.attachments.get(layout.CALIBRATION_ATTACHMENT, ""),
         rig_toml=first.attachments.get(layout.RIG_ATTACHMENT, ""),
         metadata=dict(first.metadata.get(layout.START_METADATA, {})),
-        count=sum(counts),
+        count=sum(counts) - left_out(notes, params),
         parts=tuple(found.path for found in outlines),
         end_reason="cut" if cut else end.get("reason", ""),
         faults=[fault for found in outlines for fault in found.faults],
@@ -85,26 +88,27 @@ def _no_topic(path: Path, directory: Directory, topic: str, message_type: str) -
     )
 
 
-def _read(outlines: list[Outline], params: RecordingParams, report: Report) -> Iterator[Shot]:
+def _read(outlines: list[Outline], params: RecordingParams, withdrawn: Withdrawals, report: Report) -> Iterator[Shot]:
     start = outlines[0].metadata.get(layout.START_METADATA, {}).get("start_ns", "")
     own = start.isdecimal()
     off = any(found.count(params.off_topic) for found in outlines)
     assembler = Assembler(params, report, int(start) if own else 0, own, off)
-    for found in outlines:
+    for part, found in enumerate(outlines):
         for fault in found.faults:
             report(fault)
-        for channel, message in _data(found, assembler, report):
+        for channel, message, offset in _data(found, assembler, report):
             try:
                 _take(channel, message, params, assembler)
             except MalformedMessageError as error:
                 report(f"{found.path}: message on {channel.topic} left out: {error}")
-            yield from assembler.ready()
-    yield from assembler.finish()
+            yield from (shot for shot in assembler.ready() if withdrawn.keeps(shot, part, offset))
+    yield from (shot for shot in assembler.finish() if withdrawn.keeps(shot, len(outlines), 0))
     _account(outlines, params, assembler, report)
+    withdrawn.account(outlines[0].path, report)
 
 
-def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message]]:
-    """Every message of a file in its order, with its channel; what is broken goes to `report`."""
+def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tuple[Channel, Message, int]]:
+    """Every message of a file in its order, with its channel and the byte of its record; what is broken is reported."""
     path, directory, nameless = found.path, found.directory, 0
     with mcap_records.open_mcap(path) as file:
         for record in mcap_records.walk(file):
@@ -114,7 +118,7 @@ def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tupl
                 try:
                     for message in _messages(record, mcap_records.body(file, record), directory):
                         if message.channel_id in directory.channels:
-                            yield directory.channels[message.channel_id], message
+                            yield directory.channels[message.channel_id], message, record.offset
                         else:
                             nameless += 1
                 except DamagedError as error:

@@ -7,7 +7,7 @@ import platform
 import shutil
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
@@ -25,7 +25,7 @@ from scanmap.recording import layout, messages
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.messages import SECOND_NS, Fault
 from scanmap.recording.shot_file import ShotFile
-from scanmap.shot import Shot
+from scanmap.shot import Shot, Withdrawal
 
 LEVELS = {"ok": 0, "warning": 1, "error": 2}
 MB = 1e6
@@ -140,8 +140,24 @@ class Recorder:
             seconds: when, on the clock of `Shot.time` [s].
         """
         stamp = self._start_ns + round(seconds * SECOND_NS)
-        data = messages.diagnostics(Fault(stamp, LEVELS[level], part, message), details or {})
+        data = messages.diagnostics(Fault(stamp, LEVELS[level], part, message, details or {}))
         self._write_chunk(stamp, [(self.params.diagnostics_topic, data)], 0)
+
+    def withdraw(self, indices: Collection[int], why: Withdrawal, *, seconds: float) -> None:
+        """Take back shots written so far: no replay shows them, unless asked to; they stay in the file.
+
+        Args:
+            indices: of the shots; those written later under the same index count again.
+            seconds: when, on the clock of `Shot.time` [s].
+        """
+        numbers = " ".join(map(str, sorted(indices)))
+        self.fault(
+            f"{len(indices)} shots withdrawn: {layout.WITHDRAWN_WORDS[why]}",
+            part="sweep",
+            seconds=seconds,
+            level="error",
+            details={layout.WITHDRAWN_DETAIL: numbers, layout.WITHDRAWN_WHY_DETAIL: why.value},
+        )
 
     def close(self, reason: str = "finished") -> None:
         """End the file: why (`finished`, `interrupted`, `error: ...`), how many shots, index. May be called twice.

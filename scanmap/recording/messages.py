@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +45,7 @@ class Fault(NamedTuple):
     level: int  # 0 ok, 1 warning, 2 error
     part: str
     message: str
+    details: Mapping[str, str] = MappingProxyType({})
 
 
 @cache
@@ -117,7 +119,7 @@ def static_transforms(stamp_ns: int, calibration: Calibration, joint: str) -> by
     return _encode(TF_MESSAGE, transforms=[_transform(stamp_ns, *link) for link in links])
 
 
-def diagnostics(fault: Fault, details: Mapping[str, str]) -> bytes:
+def diagnostics(fault: Fault) -> bytes:
     """CDR of a DiagnosticArray with one status."""
     pair = _type("diagnostic_msgs/msg/KeyValue")
     status = _type("diagnostic_msgs/msg/DiagnosticStatus")(
@@ -125,7 +127,7 @@ def diagnostics(fault: Fault, details: Mapping[str, str]) -> bytes:
         name=fault.part,
         message=fault.message,
         hardware_id="scanmap",
-        values=[pair(key=key, value=value) for key, value in details.items()],
+        values=[pair(key=key, value=value) for key, value in fault.details.items()],
     )
     return _encode(DIAGNOSTIC_ARRAY, header=_header(fault.stamp_ns, ""), status=[status])
 
@@ -147,7 +149,10 @@ def read_faults(data: memoryview) -> list[Fault]:
     """Parse a DiagnosticArray. Raises MalformedMessageError."""
     message = _decode(data, DIAGNOSTIC_ARRAY)
     stamp = _stamp_ns(message)
-    return [Fault(stamp, status.level, status.name, status.message) for status in message.status]
+    return [
+        Fault(stamp, status.level, status.name, status.message, {pair.key: pair.value for pair in status.values})
+        for status in message.status
+    ]
 
 
 def _type(name: str) -> Any:

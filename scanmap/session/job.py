@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +25,7 @@ from scanmap.scan.surface import remove_outliers
 from scanmap.session.outputs import Outputs, write_results
 from scanmap.session.refining import Refinement
 from scanmap.session.summary import Summary, summarise
-from scanmap.shot import Shot
+from scanmap.shot import Shot, Withdrawal
 from scanmap.twin import Truth, TruthReport
 from scanmap.view import View
 from scanmap.view.viewer import has_display
@@ -89,6 +89,8 @@ class Job:
     done: int = 0  # shots processed so far
     faults: list[str] = field(default_factory=list)  # seen so far, one line each
     _last_s: float = 0.0  # time of the last shot
+    _handed_out_indices: list[int] = field(default_factory=list)  # of shots, in the order in which they reach the scan
+    _withdrawn: set[int] = field(default_factory=set)  # places of shots in that list
 
     def __enter__(self) -> Job:
         return self
@@ -126,14 +128,22 @@ class Job:
             kind = "" if isinstance(raised, ScanmapError) else f"{type(raised).__name__}: "
             ended, error = f"error: {kind}{raised}", raised
         finally:
+            if ended == "finished" and self.recorder is not None and len(scan) and not scan.valid.any():
+                ended = "error: no laser line in any shot"
+                self._take_back(self._handed_out_indices, Withdrawal.LINE)
             self._close_recording(ended)
         if error is not None and not len(scan):
             raise error
         if not len(scan):
             if ended == "interrupted":
                 raise KeyboardInterrupt
-            raise RecordingError("there is no shot to make a scan of")
+            raise RecordingError("; ".join(["there is no shot to make a scan of", *self.source_faults[:1]]))
         return self._finished(scan, ended, error)
+
+    def withdraw(self, indices: Collection[int], why: Withdrawal) -> None:
+        """Take back shots handed out so far: they stay in the recording, but nothing is made of them."""
+        self._withdrawn.update(k for k, index in enumerate(self._handed_out_indices) if index in indices)
+        self._take_back(indices, why)
 
     def note(self, fault: str) -> None:
         """Keep a fault that was overcome, in the result and in the recording."""
@@ -166,6 +176,7 @@ class Job:
 
     def _handed_out(self, shot: Shot) -> Shot:
         self._last_s = shot.time
+        self._handed_out_indices.append(shot.index)
         return self.refinement.hand_out(shot) if self.refinement is not None else shot
 
     def _sinks(self, scan: Scan, progress: Callable[[Progress], None]) -> list[Sink]:
@@ -194,6 +205,10 @@ class Job:
 
         return show
 
+    def _take_back(self, indices: Collection[int], why: Withdrawal) -> None:
+        if self.recorder is not None and not self.recorder.closed:
+            self.recorder.withdraw(set(indices), why, seconds=self._last_s)
+
     def _close_recording(self, ended: str) -> None:
         if self.recorder is None:
             return
@@ -203,6 +218,8 @@ class Job:
             self.faults.append(str(error))
 
     def _finished(self, scan: Scan, ended: str, error: Exception | None) -> Result:
+        if self._withdrawn:
+            scan = scan.taken(np.array([k for k in range(len(scan)) if k not in self._withdrawn], np.intp))
         clean = finished_scan(scan, self.config)
         summary = summarise(clean, self.calibration)
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()

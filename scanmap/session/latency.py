@@ -19,8 +19,7 @@ from scanmap.session.preparing import Choice, rig_words
 from scanmap.session.rigs import OpenRig, open_rig
 from scanmap.shot import decode_image
 from scanmap.solvers.latency import Blink, Latency, Pass, latency_of_blinks, latency_of_sweeps
-from scanmap.sweep import SweepParams, sweep
-from scanmap.sweep.sweeping import Turning
+from scanmap.sweep import SweepParams, Turning, sweep
 
 BLINKS = 24
 REST_S = 0.35  # after a switch, beyond the latency searched for

@@ -97,13 +97,15 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool, resume: Path |
         truth=opened.truth,
         closers=[opened.close],
     )
-    sweeping.note = job.note
+    sweeping.note, sweeping.withdraw = job.note, job.withdraw
     with _opened(job):
         if not is_twin:
             head.check_image(opened.rig.camera.width, opened.rig.camera.height)
         if earlier is not None:
             job.announcement += [earlier.words, sweeping.prove_place()]
             job.source_faults = earlier.source.faults
+        else:
+            sweeping.look_first()
         _open_view(job, title=config.description or opened.rig.name, is_twin=is_twin, live=view)
         job.recorder = _recorder(config, head, outputs, swept, opened.rig.name, earlier)
     return job

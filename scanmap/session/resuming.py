@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from scanmap.errors import ConfigError, StageError
 from scanmap.recording import Source, is_later_part, next_part, open_source
 from scanmap.session.rigs import OpenRig
 from scanmap.shot import Shot
-from scanmap.sweep import Homable, Plan, Settable, Steps, Watch, plan
+from scanmap.sweep import Homable, Place, Plan, Settable, Steps, Turning, Turns, Watch, missing, passes, plan
 
 CHANGEABLE = ("stage", "camera", "recording", "view")  # sections that may differ: another port, another disk
 SAME_PLACE_RAD = math.radians(0.01)
 CORRECTIONS = 3  # of the head's place by the picture
 AGREE_RAD = math.radians(1.0)  # answers of different pictures that mean one place: nearness of things shifts them
+WITNESSES = 6  # recorded pictures that are asked in turn whether the head stands as it did
 LANDMARKS = 60  # recorded pictures that the head's present view is searched in
 
 
@@ -28,6 +30,7 @@ class Earlier:
     """The parts of a scan that are there."""
 
     source: Source
+    landmarks: Source  # the same, with shots that show the room but not the laser
     config: Config  # what it was scanned with
     calibration: Calibration
     planned: Plan
@@ -67,29 +70,33 @@ def earlier_parts(path: Path, settings: tuple[str, ...] = ()) -> Earlier:
     if not source.rig_toml or not source.metadata.get("start_ns", "").isdecimal():
         raise ConfigError(f"{path} does not say which rig and plan it is of: only scanmap's own recordings are resumed")
     config = configuration.parse(source.rig_toml, f"configuration in {path}", settings)
-    if config.sweep.mode == "continuous":
-        raise ConfigError(
-            f"{path} is a continuous sweep, which can only be made anew: scan again; what is there can be had with "
-            f"scanmap replay {path}"
-        )
     planned = plan(config.sweep, config.stage.limits)
-    seen = [(shot.index, shot.bearing, shot.time) for shot in source.shots()]
-    done = frozenset(index for index, _, _ in seen)
-    first_pass_done = done >= set(range(len(planned.bearings)))
-    if first_pass_done and (config.sweep.mode != "adaptive" or source.end_reason == "finished"):
+    landmarks = open_source(path, recording.model_copy(update={"withdrawn": "keep-unlit"}))
+    seen = [(shot.index, shot.bearing, shot.time) for shot in landmarks.shots()]
+    if not seen:
+        raise ConfigError(f"{path} has no shot from a bearing that can be trusted: scan again")
+    done = frozenset(shot.index for shot in source.shots())
+    if _is_complete(planned, done) and (config.sweep.mode != "adaptive" or source.end_reason == "finished"):
         raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {path}")
     return Earlier(
         source=source,
+        landmarks=landmarks,
         config=config,
         calibration=source.calibration(),
         planned=planned,
         done=done,
-        shots=len(seen),
+        shots=len(done),
         bearings=tuple(bearing for _, bearing, _ in seen),
         last_s=max(time_s for _, _, time_s in seen),
         part=next_part(path),
         start_ns=int(source.metadata["start_ns"]),
     )
+
+
+def _is_complete(planned: Plan, done: frozenset[int]) -> bool:
+    if planned.params.mode == "continuous":
+        return not any(missing(planned, turn, done) for turn in passes(planned))
+    return done >= set(range(len(planned.bearings)))
 
 
 def _check(path: Path, settings: tuple[str, ...]) -> None:
@@ -131,40 +138,69 @@ def prove_place(opened: OpenRig, earlier: Earlier, watch: Watch) -> str:
             )
         if known != here.bearing:
             stage.stand_at(known)
-    last = _last(earlier)
-    shift = again = None
-    for _ in range(1 + CORRECTIONS):
-        if shift is not None and again is not None and isinstance(stage, Settable):
-            stage.stand_at(again.bearing + shift.columns_px / watch.px_per_rad)
-        again = steps.shoot(last.index, last.bearing_commanded)
-        shift = watch.shift(last, again)
-        if shift is None or shift.is_small:
+    shoot = steps.shoot
+    if earlier.planned.params.mode == "continuous" and isinstance(stage, Turning):
+        shoot = Turns(opened.rig, stage, earlier.planned, opened.clock).shoot  # as those it is held against
+    for shot in _witnesses(earlier):
+        if (slack_px := _recognised_at(shot, shoot, opened, watch)) is not None:
             break
-    where = f"{math.degrees(last.bearing):.2f} deg, shot last,"
-    if shift is None:
+    else:
         raise StageError(
-            f"the picture at {where} is not recognised, so nothing proves where the head stands: set the head to its "
-            "home by hand and resume again, or give it a switch or index mark (stage.homing)"
+            f"the picture at {math.degrees(shot.bearing):.2f} deg is not recognised, so nothing proves where the head "
+            "stands: set the head to its home by hand and resume again, or give it a switch or index mark "
+            "(stage.homing)"
         )
-    off_deg, slack_deg = (math.degrees(px / watch.px_per_rad) for px in (shift.columns_px, shift.slack_px))
-    if not shift.is_small:
-        raise StageError(
-            f"the picture at {where} shows the head {off_deg:.2f} deg off: set it to its home by hand and resume again"
-        )
-    watch.trust(last)
-    return f"the picture at {where} was recognised: the head stands within {slack_deg:.2f} deg of where it stood"
+    watch.trust(shot)
+    return (
+        f"the picture at {math.degrees(shot.bearing):.2f} deg was recognised: the head stands within "
+        f"{math.degrees(slack_px / watch.px_per_rad):.2f} deg of where it stood"
+    )
+
+
+def _recognised_at(shot: Shot, shoot: Callable[[Place], Shot], opened: OpenRig, watch: Watch) -> float | None:
+    """Shoot again where a shot was taken, and set the head's place by it; how far off it may still be [px].
+
+    None where the pictures do not tell.
+
+    Raises:
+        StageError: it stands elsewhere, and nobody can tell the stage so.
+    """
+    stage = opened.rig.stage
+    shift, off_px = None, 0.0
+    for _ in range(1 + CORRECTIONS):
+        if shift is not None and isinstance(stage, Settable):
+            stage.stand_at(stage.where() + off_px / watch.px_per_rad)
+        again = shoot(Place(shot.index, shot.bearing_commanded))
+        shift = watch.shift(shot, again)
+        if shift is None:
+            return None
+        off_px = shift.columns_px - watch.px_per_rad * (again.bearing - shot.bearing)
+        if abs(off_px) <= shift.slack_px:
+            return shift.slack_px
+    raise StageError(
+        f"the picture at {math.degrees(shot.bearing):.2f} deg shows the head "
+        f"{math.degrees(off_px / watch.px_per_rad):.2f} deg off: set it to its home by hand and resume again"
+    )
+
+
+def _witnesses(earlier: Earlier) -> list[Shot]:
+    """Recorded shots that can prove the head's place: the last, and some on the way back to the first."""
+    times = sorted((shot.time for shot in earlier.landmarks.shots()), reverse=True)
+    wanted = times[:: max(1, (len(times) - 1) // (WITNESSES - 1))][:WITNESSES]
+    found = {shot.time: shot for shot in earlier.landmarks.shots() if shot.time in wanted}
+    return [found[time_s] for time_s in wanted]
 
 
 def _last(earlier: Earlier) -> Shot:
-    return max(earlier.source.shots(), key=lambda shot: shot.time)
+    return max(earlier.landmarks.shots(), key=lambda shot: shot.time)
 
 
 def _recognised(here: Shot, earlier: Earlier, watch: Watch) -> float | None:
     """The bearing [rad] that the head truly stands at, from the recorded pictures; None where they do not tell."""
     nearest = min(earlier.bearings, key=lambda bearing: abs(bearing - here.bearing))
-    every = max(1, earlier.shots // LANDMARKS)
+    every = max(1, len(earlier.bearings) // LANDMARKS)
     answers: list[tuple[float, float]] = []  # how much alike, and where that would be [rad]
-    for count, shot in enumerate(earlier.source.shots()):
+    for count, shot in enumerate(earlier.landmarks.shots()):
         if count % every and shot.bearing != nearest:
             continue
         shift = watch.shift(shot, here)

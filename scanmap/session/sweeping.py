@@ -12,7 +12,7 @@ from scanmap.session.resuming import Earlier, prove_place
 from scanmap.session.rigs import OpenRig
 from scanmap.session.watching import watch_of
 from scanmap.shot import Shot
-from scanmap.sweep import Plan, sweep
+from scanmap.sweep import Plan, Withdraw, grab, sweep
 
 
 class Sweeping:
@@ -26,6 +26,7 @@ class Sweeping:
         self._planned = planned
         self._earlier = earlier
         self.note: Callable[[str], None] = lambda _: None  # told of every fault that was overcome, one line each
+        self.withdraw: Withdraw = lambda indices, why: None  # told of shots that cannot be trusted
         self._watch = watch_of(config, calibration)
         self.refinement = Refinement(config, calibration) if config.sweep.mode == "adaptive" else None
 
@@ -33,6 +34,18 @@ class Sweeping:
         """Before a scan is gone on with: see `resuming.prove_place`."""
         assert self._earlier is not None
         return prove_place(self._opened, self._earlier, self._watch)
+
+    def look_first(self) -> None:
+        """Before a scan begins: what the head sees where it stands, so that it cannot be moved unnoticed any more.
+
+        Raises:
+            CameraError, StageError: the camera sends nothing usable, or the board does not answer.
+        """
+        if self._config.sweep.watch:
+            camera, stage = self._opened.rig.camera, self._opened.rig.stage
+            frame = grab(camera, self._config.sweep.retries, self.note)
+            here = stage.where()
+            self._watch.stand_from(Shot(-1, here, here, frame.time, frame.image, frame.image))
 
     def shots(self) -> Iterator[Shot]:
         """The shots that are still to be taken, on the clock of the scan."""
@@ -50,7 +63,8 @@ class Sweeping:
             watch=self._watch if self._config.sweep.watch else None,
             done=earlier.done if earlier is not None else (),
             note=self.note,
+            withdraw=self.withdraw,
         ):
             if twin is not None:
-                twin.camera.remember([shot.bearing])
+                twin.camera.shot_taken(shot.bearing)
             yield replace(shot, time=shot.time + offset_s)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from scanmap.calibration import Calibration
@@ -12,6 +14,8 @@ from scanmap.shot import decode_image
 from scanmap.sweep import Watch
 from scanmap.triangulation import column_window
 
+JITTER_S = 0.02  # by which the time of a picture taken while the head turns may be off
+LATENCY_S = 0.15  # by which it may be wrong altogether, where the camera's latency was never measured
 EVERY_ROW = 8  # of those that are asked for a line: the question is only whether there is one
 
 
@@ -31,4 +35,6 @@ def watch_of(config: Config, calibration: Calibration) -> Watch:
             return 1.0
         return float(np.isfinite(find_laser_line(rows, params, dark, window).column_px).mean())
 
-    return Watch(calibration.intrinsics.fx, calibration.intrinsics.width, lit)
+    speed = math.radians(config.sweep.speed_deg_s) if config.sweep.mode == "continuous" else 0.0
+    own = calibration.intrinsics
+    return Watch(own.fx, own.width, lit, slack_rad=speed * JITTER_S, latency_rad=speed * LATENCY_S)

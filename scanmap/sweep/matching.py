@@ -6,6 +6,7 @@ The pictures are compared without the laser line, which turns with the head and 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -27,6 +28,8 @@ SAME_PX, SAME_SIGMA = (
     0.5,
     5.0,
 )  # [px of the small pictures], [standard deviations]: two of one place are no farther apart
+SMOOTH_PX = 3.0  # noise is finer than what two places differ in
+KEPT = 6  # pictures kept small, for each is held against several
 
 F32 = NDArray[np.float32]
 
@@ -99,6 +102,22 @@ def _likeness(first: F32, second: F32, columns: int) -> float:
     return float((a * b).sum()) / size if size > 0 else 0.0
 
 
+def difference(before: bytes, after: bytes) -> float:
+    """By how much two encoded pictures differ, laser line and all [grey levels, rms]; their noise makes a little.
+
+    Even where a plain or dark room gives nothing to match, two places differ in their shading or in the line.
+
+    Raises:
+        CameraError: a picture cannot be decoded, or the two have different sizes.
+    """
+    first, second = (_small(image)[0] for image in (before, after))
+    if first.shape != second.shape:
+        raise CameraError(f"pictures of {first.shape} and {second.shape} pixels cannot be compared")
+    apart = first - second
+    apart -= apart.mean(axis=1, keepdims=True)  # lamps that flicker make some rows darker, all along
+    return float(cv2.GaussianBlur(apart, (0, 0), SMOOTH_PX).std())
+
+
 def scale_of(width: int) -> float:
     """How many pixels of a picture make one of those that are compared."""
     return max(1.0, width / WIDTH)
@@ -117,6 +136,7 @@ def same_line(before: bytes, after: bytes) -> bool:
     return bool(seen.any() and (np.abs(first - second)[seen] > 1.0).mean() < ELSEWHERE)
 
 
+@lru_cache(maxsize=KEPT)
 def _structure(image: bytes) -> tuple[F32, float]:
     """Edges and textures (h, w) of a picture, small and without the laser line; and how many pixels make one."""
     small, scale = _small(image)
@@ -146,6 +166,7 @@ def _sharp(small: F32) -> F32:
     return np.asarray(small - cv2.GaussianBlur(small, (0, 0), BROAD_PX), np.float32)
 
 
+@lru_cache(maxsize=KEPT)
 def _small(image: bytes) -> tuple[F32, float]:
     """A picture in grey, at most WIDTH wide, and how many of its pixels make one of these."""
     data = np.frombuffer(image, np.uint8)

@@ -6,35 +6,21 @@ Uses nothing of a rig but its two protocols, so the twin and the real head are s
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from itertools import pairwise
 from typing import Protocol, runtime_checkable
-
-import numpy as np
 
 from scanmap.errors import ConfigError, ScanmapError
 from scanmap.rig import Rig
 from scanmap.shot import Shot
 from scanmap.sweep.planning import CABLE_LIMITS, Plan, SweepParams, plan
-from scanmap.sweep.stepping import Refine, Steps, expose, grab
+from scanmap.sweep.proving import Withdraw
+from scanmap.sweep.stepping import Refine, Steps
+from scanmap.sweep.turning import Turning, Turns
 from scanmap.sweep.watching import Watch
 
-HISTORY = 100  # reports kept for frames that arrive late
-SAMPLE_RAD = math.radians(0.02)  # how far off one report of a turning head may be
-
 logger = logging.getLogger(__name__)
-
-
-@runtime_checkable
-class Turning(Protocol):
-    """A stage that can be watched while it turns, as continuous sweeps need."""
-
-    def start_turn(self, bearing: float, speed: float) -> None:
-        """Begin to turn to `bearing` [rad] at `speed` [rad/s] and return at once; `move_to` then arrives."""
-        ...
 
 
 @runtime_checkable
@@ -58,6 +44,7 @@ def sweep(
     watch: Watch | None = None,
     done: Collection[int] = (),
     note: Callable[[str], None] = lambda _: None,
+    withdraw: Withdraw = lambda indices, why: None,
 ) -> Iterator[Shot]:
     """Shoot a rig around, bearing by bearing.
 
@@ -70,8 +57,9 @@ def sweep(
         clock: the clock that frames are stamped with [s]; continuous sweeps ask the stage by it.
         refine: adaptive sweeps ask it for further bearings after the first pass.
         watch: holds the pictures against each other, to notice lost steps, a stalled motor and a dead laser.
-        done: indices of shots that an interrupted sweep took already; not for continuous ones.
+        done: indices of shots that an interrupted sweep took already.
         note: told of every fault that was overcome: a retry, a homing.
+        withdraw: told of shots that turned out not to be trusted; they come again under their index, if they can.
 
     Yields:
         `Shot` with the bearing that the stage reported; time counts from the first frame.
@@ -86,8 +74,9 @@ def sweep(
     if params.mode == "continuous":
         if not isinstance(rig.stage, Turning):
             raise ConfigError("sweep.mode = 'continuous' needs a stage of kind grbl: choose step or adaptive")
-        return _guarded(rig, params, planned, _turn(rig, rig.stage, planned, stop, clock, note))
-    steps = Steps(rig, planned, sleep, watch, note)
+        turns = Turns(rig, rig.stage, planned, clock, watch, note, withdraw)
+        return _guarded(rig, params, planned, turns.shots(stop, done))
+    steps = Steps(rig, planned, sleep, watch, note, withdraw)
     return _guarded(rig, params, planned, steps.shots(stop, refine, done))
 
 
@@ -102,65 +91,6 @@ def _guarded(rig: Rig, params: SweepParams, planned: Plan, shots: Iterator[Shot]
         failed = False
     finally:
         _leave(rig, planned.bearings[0] if params.park else None, failed=failed)
-
-
-def _turn(
-    rig: Rig,
-    stage: Turning,
-    planned: Plan,
-    stop: Callable[[], bool],
-    clock: Callable[[], float],
-    note: Callable[[str], None],
-) -> Iterator[Shot]:
-    """Shoot while turning; a frame's bearing is interpolated between what the stage reported around it.
-
-    Frames taken while the head sped up or slowed down are left out: a line between two reports is wrong there.
-    """
-    params = planned.params
-    speed = math.radians(params.speed_deg_s)
-    count = len(np.unique(planned.bearings))
-    index = 0
-    for number, (start, end) in enumerate(planned.bearings.reshape(-1, count)[:, [0, -1]].tolist()):
-        rig.stage.move_to(start)
-        if (exposure_us := planned.exposure_us(number)) is not None:
-            expose(rig.camera, exposure_us)
-        rig.stage.laser(True)
-        track = [_sample(rig, clock)]
-        stage.start_turn(end, speed)
-        last = -math.inf
-        while abs(track[-1][1] - start) < abs(end - start) - 1e-4 and not stop():
-            frame = grab(rig.camera, params.retries, note, moving=True)
-            track = [*track[-HISTORY:], _sample(rig, clock)]
-            bearing = _steady_bearing(track, frame.time - params.latency_s, speed)
-            if math.isnan(bearing) or abs(bearing - last) < math.radians(params.step_deg) * 0.99:
-                continue
-            last = bearing
-            yield Shot(index, bearing, bearing, frame.time, frame.image, None)
-            index += 1
-        if stop():
-            return
-
-
-def _steady_bearing(track: list[tuple[float, float]], moment: float, speed: float) -> float:
-    """The bearing at `moment` [rad]; NaN if the head did not turn at `speed` then.
-
-    Args:
-        track: times [s] and bearings reported then [rad].
-    """
-    for (before, here), (after, there) in pairwise(track):
-        if before <= moment <= after:
-            way = abs(there - here)
-            if abs(way - speed * (after - before)) > 0.05 * way + SAMPLE_RAD:
-                return math.nan
-            return here + (there - here) * (moment - before) / (after - before)
-    return math.nan
-
-
-def _sample(rig: Rig, clock: Callable[[], float]) -> tuple[float, float]:
-    """When, and the bearing reported then."""
-    before = clock()
-    bearing = rig.stage.where()
-    return (before + clock()) / 2, bearing
 
 
 def _leave(rig: Rig, park: float | None, *, failed: bool) -> None:

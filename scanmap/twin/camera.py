@@ -125,6 +125,14 @@ class TwinCamera:
         self._taken.update(round(bearing, VIEW_DIGITS) for bearing in bearings)
         self._looks.clear()
 
+    def shot_taken(self, bearing: float) -> None:
+        """As `remember`, of the shot just taken, by where the board says it was [rad].
+
+        A head that stands elsewhere has looked at other views; then it is those that were shot.
+        """
+        views = {view for view, _ in self._looks}
+        self.remember([bearing] if not views or round(bearing, VIEW_DIGITS) in views else views)
+
     def expose(self, exposure_us: float) -> None:
         """Expose so long from the next picture on [us]."""
         self._gain = np.float32(exposure_us / self._params.exposure_us)
