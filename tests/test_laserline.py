@@ -370,7 +370,7 @@ def boards_found(data, numbers, params, change=None):
     return (*found / carry, astray / (480 * len(numbers)))
 
 
-@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.9, 0.03), ("green", 0.91, 0.01)])
+@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.9, 0.03), ("green", 0.93, 0.01)])
 def test_a_line_on_white_boards_before_a_cabinet_full_of_things(data, grey, least, most_astray):
     on_board, beside, astray = boards_found(data, board_lines.NUMBERS[::4], LaserLineParams(grey=grey))
     assert on_board >= least
