@@ -2,13 +2,11 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
-import board_lines
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from line_pairs import PIECES, marked, pair
 from synthetic_lines import GREEN, HARD, RED, LineSpec, bound, clean, hard_frame, line_light, score, sensor
 
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
@@ -304,90 +302,9 @@ def test_colour_finds_what_its_own_plane_finds(laser):
     assert rms(in_colour.column_px - truth) <= 1.1 * bound(spec)
 
 
-# Photographs
-
-
-def green_excess(image):
-    """Column (H,) of each row's narrowest, greenest place, and whether it is clear and goes on along the rows."""
-    b, g, r = np.moveaxis(image.astype(np.float32), 2, 0)
-    excess = g - 0.5 * (b + r)
-    narrow = cv2.blur(cv2.GaussianBlur(excess, (0, 0), 1.5) - cv2.GaussianBlur(excess, (0, 0), 9.0), (1, 3))
-    column = narrow.argmax(axis=1)
-    return column, (narrow.max(axis=1) > 7.0) & continues(column)
-
-
-def continues(column):
-    """Rows (H,) whose column most of the eight neighbouring rows continue."""
-    near = [np.abs(np.roll(column, k) - column) <= 2.0 + 1.6 * abs(k) for k in (-4, -3, -2, -1, 1, 2, 3, 4)]
-    return np.sum(near, axis=0) >= 6
-
-
-def photographs_found(data, folder, pattern, step, reference, rows=slice(None)):
-    """Fraction of the rows with a clear line in a photograph that the detector finds there, and elsewhere."""
-    files = sorted((data / "real" / folder).glob(pattern))[::step]
-    assert files
-    clear = hit = astray = 0
-    for file in files:
-        image = cv2.imread(str(file))
-        column, good = reference(image)
-        line = find_laser_line(image, GAUSS)
-        off, good = np.abs(line.column_px - column)[rows], good[rows]
-        clear, hit, astray = clear + good.sum(), hit + (good & (off < 6)).sum(), astray + (good & (off >= 6)).sum()
-    assert clear > 100 * len(files)
-    return hit / clear, astray / clear
-
-
-@pytest.mark.parametrize("number", sorted(PIECES))
-def test_a_line_of_one_or_two_pixels_is_found_with_an_off_frame(data, number):
-    """Sharpened and compressed pictures 240 columns wide; exposure changes, lamp, black and glossy things."""
-    on, off = pair(data / "real" / "laser-range-finder" / "images", number)
-    row = marked(number)
-    column = find_laser_line(on, GAUSS, off).column_px
-    near, carries = np.abs(column - row) <= 4.0, np.isfinite(row)
-    assert near[carries].mean() >= (0.94 if number == 10 else 0.95)
-    assert np.mean(np.isfinite(column[carries]) & ~near[carries]) <= 0.005
-
-
-def test_the_lasers_channel_is_told_on_a_white_board_in_a_bright_room(data):
-    files = sorted((data / "real" / "srv-calib" / "laser").glob("*.jpg"))[::4]
-    channels = [laser_channel(np.asarray(cv2.imread(str(file)), np.uint8)) for file in files]
-    assert np.mean(np.array(channels) == 1) >= 0.95
-
-
-def boards_found(data, numbers, params, change=None):
-    """Share of the rows found where a board carries the line, and beside it; and of all rows found elsewhere."""
-    folder = data / "real" / "srv-calib" / "laser"
-    carry, found, astray = np.zeros(2), np.zeros(2), 0
-    for number in numbers:
-        image, columns = board_lines.picture(folder, number), board_lines.marked(number)
-        on_board, beside = board_lines.carrying(image, columns)
-        column = find_laser_line(image if change is None else change(image), params).column_px
-        off = np.abs(column - columns)
-        near = ((off <= 4.0) & np.stack([on_board, beside])).any(axis=0)
-        for k, rows in enumerate((on_board, beside & ~on_board)):
-            carry[k], found[k] = carry[k] + rows.sum(), found[k] + (rows & near).sum()
-        astray += (np.isfinite(column) & ~(off <= 6.0).any(axis=0)).sum()
-    return (*found / carry, astray / (480 * len(numbers)))
-
-
-@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.9, 0.03), ("green", 0.93, 0.01)])
-def test_a_line_on_white_boards_before_a_cabinet_full_of_things(data, grey, least, most_astray):
-    on_board, beside, astray = boards_found(data, board_lines.NUMBERS[::4], LaserLineParams(grey=grey))
-    assert on_board >= least
-    assert beside >= 0.55
-    assert astray <= most_astray
-
-
 def test_white_between_red_stripes_is_no_green_laser():
     image = np.full((240, 400, 3), 40, np.uint8)
     image[:, 100:300] = (30, 30, 160)
     image[:, 104:300:12], image[:, 105:300:12] = (150, 155, 160), (150, 155, 160)
     red = line_light(np.full(240, 350.0), 60.0, 1.5, 400)[..., None] * np.float32(RED)
     assert laser_channel(sensor(image + red, 1.5, np.random.default_rng(0))) == 2
-
-
-def test_a_thin_line_on_white_plaster_in_a_bright_room(data):
-    # The wall, above the table's edge.
-    found, astray = photographs_found(data, "srv-calib/table", "*.jpg", 8, green_excess, slice(0, 240))
-    assert found >= 0.97
-    assert astray <= 0.005

@@ -70,9 +70,20 @@ def judged_channel(image: U8, background: U8 | None = None) -> tuple[int, bool]:
 
 
 def _every(step: int, first: int, image: U8, background: U8 | None) -> U8:
-    """Some rows (n, W, 3) of a picture, less those of the background."""
+    """Some rows (n, W, 3) of a picture, less those of the background as each channel is exposed."""
     rows = image[first::step]
-    return rows if background is None else np.asarray(cv2.subtract(rows, background[first::step]), np.uint8)
+    if background is None:
+        return rows
+    off = background[first::step]
+    for_each = np.diag([exposure_gain(rows[:, ::4, c], off[:, ::4, c]) for c in range(3)]).astype(np.float32)
+    return np.asarray(cv2.subtract(rows, cv2.transform(off, for_each)), np.uint8)
+
+
+def exposure_gain(plane: U8, background: U8) -> float:
+    """What laser-off samples must be multiplied by to match the laser-on ones where neither saturates."""
+    on, off = plane.astype(np.float32), background.astype(np.float32)
+    usable = (off > 8) & (off < 240) & (on < 240)
+    return float(np.median(on[usable] / off[usable])) if np.count_nonzero(usable) > 50 else 1.0
 
 
 def _chains(rising: U8, step: int) -> list[float]:

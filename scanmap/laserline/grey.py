@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.errors import ConfigError
-from scanmap.laserline.channel import SATURATED, laser_channel
+from scanmap.laserline.channel import SATURATED, exposure_gain, laser_channel
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -90,7 +90,7 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0, gain: 
         threshold: differences below it count as none [grey levels].
         gain: what `exposure_gain` gives, where it is known.
     """
-    gain = exposure_gain(plane, background) if gain is None else gain
+    gain = exposure_gain(plane[::8, ::8], background[::8, ::8]) if gain is None else gain
     lit = np.empty(plane.shape, np.uint8)
     # Some rows at a time, which stay in the processor's cache from step to step; smoothing needs one more on each side.
     for top in range(0, len(plane), _ROWS_AT_ONCE):
@@ -112,13 +112,6 @@ def _less(plane: U8, background: U8, threshold: float, gain: float) -> U8:
     if threshold > 0:
         lit[lit < PEDESTAL + threshold] = PEDESTAL
     return np.asarray(lit, np.uint8)
-
-
-def exposure_gain(plane: U8, background: U8) -> float:
-    """What the laser-off plane must be multiplied by to match the laser-on one where neither saturates."""
-    on, off = plane[::8, ::8].astype(np.float32), background[::8, ::8].astype(np.float32)
-    usable = (off > 8) & (off < 240) & (on < 240)
-    return float(np.median(on[usable] / off[usable])) if usable.sum() > 50 else 1.0
 
 
 def binary_image(plane: U8) -> U8:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, is_large, noise_of
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
-from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, exposure_gain, extract, to_grey, without_background
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
+from scanmap.laserline.offmatch import at_exposure, in_place
 
 U8 = NDArray[np.uint8]
 
@@ -47,6 +48,8 @@ class Sight(NamedTuple):
 def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     """Look at a grey (H, W) or BGR picture (H, W, 3), with the laser-off frame of the same view or None."""
     channel = None
+    if background is not None:
+        background = in_place(image, background)
     if image.ndim == 3:
         channel, clear = channel_of(image, background, how.grey)
         if channel is not None and not clear and without_colour(image):
@@ -60,8 +63,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off, gain = None, 1.0
     if background is not None:
-        off = to_grey(background, how.grey, how.bit_index, channel)
-        gain = exposure_gain(on, off)
+        off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
     rows = np.ascontiguousarray(quick_rows(lit))
     return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows), gain=gain)
