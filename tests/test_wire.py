@@ -465,6 +465,17 @@ def test_a_setting_that_a_damaged_line_stored_wrongly_is_written_again_then_refu
         play([*OPEN_GRBL[:6], lost, again[0], lost])
 
 
+def test_a_weak_laser_and_a_step_rate_beyond_an_arduino_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    told = SETTINGS_OF_SCANS.replace(b"$32=0", b"$30=20000\r\n$32=0").replace(b"$110=1200", b"$110=30000")
+    quick = [(b"?", at(0)), (b"$$\n", told), (b"G21 G90 G94 G1 F24000.0\n", OK), (b"M5\n", OK)]
+    play(quick, speed_deg_s=400.0)
+    assert "gives the laser 5 % of its power: $30 is 20000; set stage.laser_s" in caplog.text
+    assert "is to make 32000 steps a second, an Arduino makes 30000" in caplog.text
+    caplog.clear()
+    play([quick[0], quick[1], PREAMBLE, quick[3]], laser_s=1000.0)
+    assert not caplog.text
+
+
 def test_nothing_is_sent_while_a_board_writes_its_memory() -> None:
     """An AVR hears nothing meanwhile: not even `?`, which is asked every 12 ms otherwise."""
 

@@ -12,6 +12,7 @@ from scanmap.rig.stage import StageParams
 
 HOLD_FOREVER = 255.0  # $1: the motor holds between moves
 IDLE_MS_DEFAULT = 25.0  # $1 of a fresh board
+MOST_STEPS_HZ = 30_000.0  # of grbl on an AVR; others make more
 WRITES = 2  # a setting that is wrong after being written so often is an error
 
 logger = logging.getLogger(__name__)
@@ -52,8 +53,29 @@ def _fit_numbered(link: GrblLink, params: StageParams) -> dict[str, float]:
         number, value = next(iter(wrong.items()))
         kept = settings.get(number, math.nan)
         raise StageError(f"stage {link.name} keeps ${number}={kept:g} although it was told {value:g}: set it by hand")
+    _warn(link.name, settings, params)
     exact = {"100": params.steps_per_deg} if params.steps_per_deg and found.get("100") != settings.get("100") else {}
     return settings | exact | {number: found[number] for number in ("1",) if number in found}
+
+
+def _warn(name: str, settings: dict[str, float], params: StageParams) -> None:
+    """Say what the board takes and yet will not do."""
+    full = settings.get("30", 0.0)
+    if params.laser == "grbl" and "laser_s" not in params.model_fields_set and params.laser_s < full:
+        logger.warning(
+            "%s gives the laser %.0f %% of its power: $30 is %g; set stage.laser_s",
+            name,
+            100 * params.laser_s / full,
+            full,
+        )
+    rate = settings.get("100", 0.0) * params.speed_deg_s
+    if rate > MOST_STEPS_HZ:
+        logger.warning(
+            "%s is to make %.0f steps a second, an Arduino makes %.0f: lower stage.speed_deg_s",
+            name,
+            rate,
+            MOST_STEPS_HZ,
+        )
 
 
 def _read_numbered(link: GrblLink) -> dict[str, float]:
