@@ -411,6 +411,26 @@ def test_after_an_unasked_restart_nothing_moves_until_homed(uno: Uno) -> None:
     stage.close()
 
 
+@pytest.mark.parametrize("dialect", ["grbl", "grblHAL", "FluidNC"])
+@pytest.mark.parametrize("moment", ["at rest", "in mid-way"])
+def test_a_restart_is_noticed_although_its_banner_got_lost(dialect: DialectName, moment: str) -> None:
+    board = Firmware(dialect=dialect, instant=moment == "at rest")
+    with plug(board) as url:
+        stage = open_grbl(StageParams(port=url, timeout_s=0.3, speed_deg_s=60.0))
+        stage.move_to(0.2)
+        if moment == "in mid-way":
+            stage.start_turn(1.0, 0.5)
+        board.power_cycle()
+        board.read(1 << 16)
+        place = board.bearing
+        with pytest.raises(StageError, match="restarted by itself"):
+            stage.move_to(1.0)
+        if moment == "at rest":
+            assert board.bearing == place
+        stage.close()
+    assert not board.laser_on
+
+
 def test_a_restart_while_homing_ends_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
     board = Firmware(switch_deg=-3.0, instant=False, drivetrain=Drivetrain(bearing_deg=90.0))
     board.memory.settings.update({22: 1, 23: 1})

@@ -100,7 +100,7 @@ CLOSE_FLUIDNC: Script = [
 
 def move(x: float, reported: float | None = None) -> Script:
     return [
-        (f"G53 G1 X{x:.4f} F1200.0\n".encode(), OK),
+        (f"G53 G1 X{x:.4f}\n".encode(), OK),
         (b"G4 P0.01\n", OK),
         (b"?", at(x if reported is None else reported)),
     ]
@@ -176,14 +176,14 @@ def test_work_coordinates_and_inches_are_undone() -> None:
 
 
 def test_lost_ok_is_noticed_by_an_idle_board_and_the_line_sent_again() -> None:
-    line = b"G53 G1 X10.0000 F1200.0\n"
+    line = b"G53 G1 X10.0000\n"
     stage, port = play([*OPEN_GRBL, (line, b""), (b"?", at(10)), (b"?", at(10)), *move(10)])
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
     finish(port)
 
 
 def test_a_hold_nobody_asked_for_is_released_once_then_said() -> None:
-    line = b"G53 G1 X10.0000 F1200.0\n"
+    line = b"G53 G1 X10.0000\n"
     held = at(4, "Hold:0")
     stage, port = play([*OPEN_GRBL, (line, b""), (b"?", held), (b"~", OK), *move(10)[1:]])
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
@@ -196,7 +196,7 @@ def test_a_hold_nobody_asked_for_is_released_once_then_said() -> None:
 
 def test_a_running_board_that_stands_still_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scanmap.rig.grbl_wait.STILL_S", 0.01)
-    line = b"G53 G1 X10.0000 F1200.0\n"
+    line = b"G53 G1 X10.0000\n"
     stage, port = play([*OPEN_GRBL, (line, OK), (b"G4 P0.01\n", b""), (b"?", at(4, "Run")), (b"?", at(4, "Run"))])
     with pytest.raises(StageError, match="runs but stands at 4: check the motor"):
         stage.move_to(math.radians(10))
@@ -210,7 +210,7 @@ def test_lost_status_is_asked_for_again() -> None:
 
 
 def test_a_line_damaged_on_its_way_is_sent_again_and_a_wrong_place_is_noticed() -> None:
-    damaged = [(b"G53 G1 X10.0000 F1200.0\n", b"error:2\r\n"), *move(10, reported=1.0), *move(10)]
+    damaged = [(b"G53 G1 X10.0000\n", b"error:2\r\n"), *move(10, reported=1.0), *move(10)]
     stage, port = play([*OPEN_GRBL, *damaged])
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
     finish(port)
@@ -233,7 +233,7 @@ def test_a_head_that_never_arrives_is_an_error_with_both_places() -> None:
     ],
 )
 def test_what_goes_wrong_is_said_in_words(reply: bytes, words: str) -> None:
-    line = b"G53 G1 X10.0000 F1200.0\n"
+    line = b"G53 G1 X10.0000\n"
     again: Script = [(line, reply)] if reply.startswith(b"error") else []
     stage, port = play([*OPEN_GRBL, (line, reply), *again])
     port.deaf_to_status = True
@@ -312,7 +312,7 @@ def test_grblhal_that_demands_homing_says_so() -> None:
 
 
 def test_grblhal_is_told_that_its_error_was_heard_or_it_would_refuse_everything_after_it() -> None:
-    damaged = [(b"G53 G1 X10.0000 F1200.0\n", b"error:2\r\n"), (b"\n", OK), *move(10)]
+    damaged = [(b"G53 G1 X10.0000\n", b"error:2\r\n"), (b"\n", OK), *move(10)]
     stage, port = play([*OPEN_HAL, *damaged], Dialect.GRBLHAL)
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
     finish(port)
@@ -321,10 +321,10 @@ def test_grblhal_is_told_that_its_error_was_heard_or_it_would_refuse_everything_
 def test_fluidnc_with_verbose_errors_says_words_instead_of_numbers() -> None:
     old = [(sent, reply) for sent, reply in OPEN_FLUIDNC]
     old[2:3] = [(old[2][0], b"error:Invalid $ statement\r\n")] * 2  # asked again, refused again: not known
-    line = b"G53 G1 X10.0000 F1200.0\n"
-    refused = [(line, b"error:Gcode undefined feed rate\r\n")] * 2
+    line = b"G53 G1 X10.0000\n"
+    refused = [(line, b"error:Gcode invalid target\r\n")] * 2
     stage, port = play([*old, *refused], Dialect.FLUIDNC)
-    with pytest.raises(StageError, match=r"refused .*error:Gcode undefined feed rate"):
+    with pytest.raises(StageError, match=r"refused .*error:Gcode invalid target"):
         stage.move_to(math.radians(10))
     finish(port)
 
@@ -373,14 +373,15 @@ def test_the_index_mark_is_where_the_probe_says_also_in_inches() -> None:
         (b"M5\n", OK),
     ]
     stage, port = play(
-        [*script, *move(-15.4, 0)[:2], (b"?", b"<Idle|MPos:-0.6063,0.0000,0.0000|FS:0,0>\r\n")], homing="index"
+        [*script, (b"G1 F1200.0\n", OK), *move(-15.4, 0)[:2], (b"?", b"<Idle|MPos:-0.6063,0.0000,0.0000|FS:0,0>\r\n")],
+        homing="index",
     )
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
     finish(port)
 
 
 def test_reports_that_a_board_sends_by_itself_do_not_prove_that_an_answer_is_lost() -> None:
-    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000 F1200.0\n", at(0) * 5 + OK), *move(10)[1:]])
+    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000\n", at(0) * 5 + OK), *move(10)[1:]])
     assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
     finish(port)
 
@@ -577,7 +578,7 @@ def test_a_work_offset_that_no_report_tells_is_asked_for() -> None:
 
 def test_an_open_door_is_said_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scanmap.rig.grbl_wait.STILL_S", 0.01)
-    line = b"G53 G1 X10.0000 F1200.0\n"
+    line = b"G53 G1 X10.0000\n"
     ajar = at(4, "Door:1")
     stage, port = play([*OPEN_GRBL, (line, b"[MSG:Check Door]\r\n"), (b"?", ajar), (b"?", ajar)])
     with pytest.raises(StageError, match="is on door: release its hold button or close its door"):
@@ -585,8 +586,35 @@ def test_an_open_door_is_said_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -
     finish(port)
 
 
+def test_a_restart_whose_banner_got_lost_is_told_by_the_feed_rate_that_is_gone() -> None:
+    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000\n", b"error:22\r\n")])
+    for _ in range(2):
+        with pytest.raises(StageError, match="restarted by itself, so its position is lost"):
+            stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_a_slow_turn_leaves_no_slow_moves_behind() -> None:
+    slow = [(b"G53 G1 X90.0000 F360.0\n", OK), (b"G53 G1 X90.0000\n", OK), (b"G1 F1200.0\n", OK)]
+    stage, port = play([*OPEN_GRBL, *slow, *move(90), *move(0)])
+    stage.start_turn(math.radians(90), math.radians(6))
+    for deg in (90, 0):
+        assert stage.move_to(math.radians(deg)) == pytest.approx(math.radians(deg))
+    finish(port)
+
+
+def test_a_turn_that_was_stopped_is_not_taken_up_again() -> None:
+    turn = (b"G53 G1 X90.0000 F360.0\n", OK)
+    stopped = [(b"!", b""), (b"?", at(40, "Hold:0")), (b"\x18", CLOSE_GRBL[-1][1]), (b"?", at(40)), PREAMBLE]
+    stage, port = play([*OPEN_GRBL, turn, *stopped, (b"G1 F1200.0\n", OK), *move(10)])
+    stage.start_turn(math.radians(90), math.radians(6))
+    stage.laser(False)
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(10))
+    finish(port)
+
+
 def test_a_banner_that_noise_has_damaged_still_means_a_restart() -> None:
-    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000 F1200.0\n", b"r\x00bl 1.1h ['$' for help]\r\n")])
+    stage, port = play([*OPEN_GRBL, (b"G53 G1 X10.0000\n", b"r\x00bl 1.1h ['$' for help]\r\n")])
     with pytest.raises(StageError, match="restarted by itself"):
         stage.move_to(math.radians(10))
     finish(port)

@@ -40,6 +40,8 @@ class GrblStage:
         self._zero_deg = 0.0  # the board's X where the head stands at home_deg
         self._from_below = False  # whether the last arrival took up the play
         self._closed = False
+        self._turning_to: float | None = None  # the board's X where a turn ends that was begun and not waited for
+        self._full_feed = self._feed = params.speed_deg_s * 60  # [deg/min]: of all moves; what the board has now
         self._watchdog: Watchdog | None = None
         link.latches_errors = dialect is Dialect.GRBLHAL
         self._prepare()
@@ -104,7 +106,9 @@ class GrblStage:
                 "turn slower (sweep.speed_deg_s), or raise the stage's"
             )
         self._link.in_motion = True
-        self._link.command(f"G53 G1 X{self._x_of(target):.4f} F{math.degrees(speed) * 60:.1f}")
+        self._feed = math.degrees(speed) * 60
+        self._turning_to = self._x_of(target)
+        self._link.command(f"G53 G1 X{self._turning_to:.4f} F{self._feed:.1f}")
 
     @property
     def homes_itself(self) -> bool:
@@ -202,7 +206,7 @@ class GrblStage:
         self._link.fault = None
         self._position.settings = fit_settings(self._link, self.dialect, self._params)
         # G1 as the standing mode: a board in laser mode lights a standing laser only then.
-        self._link.preamble = [f"G21 G90 G94 G1 F{self._params.speed_deg_s * 60:.1f}"]
+        self._link.preamble = [f"G21 G90 G94 G1 F{self._full_feed:.1f}"]
         if self._params.homing == "hand":
             for line in self._link.preamble:
                 self._link.command(line)
@@ -238,8 +242,8 @@ class GrblStage:
     def _find_index(self) -> float:
         """Turn toward smaller bearings until the probe input sees the mark; the board's X of the mark."""
         travel = self._params.direction * (self._params.max_deg - self._params.min_deg)
-        feed = self._params.speed_deg_s * 60 / 4
-        answers = self._link.command(f"G91 G38.2 X{-travel:.3f} F{feed:.1f}", silence_s=HOMING_S)
+        self._feed = self._full_feed / 4
+        answers = self._link.command(f"G91 G38.2 X{-travel:.3f} F{self._feed:.1f}", silence_s=HOMING_S)
         self._link.command("G90")
         found = next(filter(None, map(protocol.parse_probe, answers)), None)
         if found is None:
@@ -270,14 +274,20 @@ class GrblStage:
         )
 
     def _arrive(self, x: float) -> None:
-        self._link.command(f"G53 G1 X{x:.4f} F{self._params.speed_deg_s * 60:.1f}")
+        """Without F: a board that has restarted, and whose banner got lost, has none and refuses."""
+        if self._feed != self._full_feed:
+            if self._turning_to is not None and self._link.in_motion:  # a reset has ended the turn
+                self._link.command(f"G53 G1 X{self._turning_to:.4f}")
+            self._feed, self._turning_to = self._full_feed, None
+            self._link.command(f"G1 F{self._feed:.1f}")
+        self._link.command(f"G53 G1 X{x:.4f}")
         self._link.command("G4 P0.01")  # answered only when all that was planned is done
         self._link.in_motion = False
 
     def _arrive_by_jog(self, x: float) -> None:
         """A jog to a place, not by a distance: sent twice for a lost `ok`, it must not go twice as far."""
         try:
-            self._link.jog(f"$J=G53 G21 X{x:.4f} F{self._params.speed_deg_s * 60:.1f}")
+            self._link.jog(f"$J=G53 G21 X{x:.4f} F{self._full_feed:.1f}")
         except RefusedError as refusal:
             if not refusal.is_unknown:
                 raise

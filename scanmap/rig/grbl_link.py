@@ -88,6 +88,9 @@ class GrblLink:
                 return information
             if answer and self.latches_errors:
                 self._clear_error()
+            if answer.startswith("error:22,") and self.preamble:  # the preamble's feed rate is gone
+                self.fault = self.fault or self._restarted()
+                raise StageError(self.fault)
             if answer and answer == refusal:
                 break
             refusal = answer or f"no ok for {line!r}"
@@ -249,16 +252,19 @@ class GrblLink:
         if code and code[0] == "ALARM":
             self.fault = f"stage {self.name} stopped with {protocol.explain(*code)}"
         elif protocol.is_greeting(line) and not self.fault:  # after a failed homing the board restarts too
-            self.fault = (
-                f"stage {self.name} restarted by itself, so its position is lost: check its power supply, "
-                "then `scanmap stage home`"
-            )
+            self.fault = self._restarted()
         self.lit_by_startup |= protocol.lights_laser(line)
         status = protocol.parse_status(line)
         if status and status.state == "Alarm" and not self.fault:
             words = protocol.explain("ALARM", status.substate) if status.substate else "alarm: `scanmap stage home`"
             self.fault = f"stage {self.name} is in {words}"
         return status
+
+    def _restarted(self) -> str:
+        return (
+            f"stage {self.name} restarted by itself, so its position is lost: check its power supply, "
+            "then `scanmap stage home`"
+        )
 
     def _silence(self) -> str:
         self._patience_s = min(self._timeout_s, SILENT_PATIENCE_S)
