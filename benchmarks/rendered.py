@@ -26,7 +26,7 @@ from scanmap.calibration import Calibration, Intrinsics
 from scanmap.config import Config, load
 from scanmap.geometry import HeadMount, inverse, rigid, transform
 from scanmap.laserline import Reason
-from scanmap.pipeline import Pipeline, run
+from scanmap.pipeline import Pipeline, SecondLook, run
 from scanmap.raycast import RayScene
 from scanmap.recording import open_source
 from scanmap.scan import Scan
@@ -85,7 +85,9 @@ def replay(shots: list[Shot], calibration: Calibration, config: Config) -> tuple
     pipeline = Pipeline(calibration, config.laserline, config.triangulation)
     scan = Scan(calibration.mount, calibration.intrinsics.height)
     start = time.process_time()
-    run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing)])
+    second = SecondLook(pipeline)
+    run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second])
+    second.settle(scan, lambda: shots)
     finished = finished_scan(scan, config)
     spent = time.process_time() - start
     return finished, np.bincount(finished.reason.ravel(), minlength=len(Reason)).astype(np.float64), spent

@@ -1,15 +1,19 @@
 """Image (+ background) to `LaserLine`: one sub-pixel column per row."""
 
+from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.grey import binary_image, overlay, to_grey
-from scanmap.laserline.line import LaserLineParams, find_laser_line, needs_colour
-from scanmap.laserline.result import LaserLine, Reason
+from scanmap.laserline.line import LaserLineParams, find_laser_line, look, needs_colour
+from scanmap.laserline.result import LaserLine, Look, Reason
 
 __all__ = [
+    "BLOCK",
     "LaserLine",
     "LaserLineParams",
+    "Look",
     "Reason",
     "binary_image",
     "find_laser_line",
+    "look",
     "needs_colour",
     "overlay",
     "to_grey",

@@ -12,6 +12,7 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
+Mask = NDArray[np.bool_]
 
 BLOCK = 4  # rows summed into one: a quarter of the search, twice the signal to noise
 COUNT = 6  # candidates per block
@@ -50,7 +51,13 @@ def noise_of(plane: U8) -> float:
 
 
 def find_candidates(
-    plane: U8, window: F64, noise: float, min_snr: float, other: U8 | None = None, large: bool = False
+    plane: U8,
+    window: F64,
+    noise: float,
+    min_snr: float,
+    other: U8 | None = None,
+    large: bool = False,
+    still: Mask | None = None,
 ) -> Candidates:
     """The strongest narrow bright places of each block of rows.
 
@@ -62,6 +69,7 @@ def find_candidates(
         other: (B, W) the middle rows' mean of a channel in which the laser hardly shows, by blocks; what stands
             out there too is a thing, not the line.
         large: half the columns are enough for the finest search.
+        still: (B, W) places that are no candidates.
 
     The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
     have a bright side and score nothing. It is compared in grey levels, not in units of noise: what competes with
@@ -86,6 +94,9 @@ def find_candidates(
         response = _stands_out(own, shape)
         if elsewhere is not None and saturated is not None:
             response = _less_elsewhere(response, _stands_out(elsewhere, shape), saturated)
+        if still is not None:
+            across = still[:, : scale * response.shape[1]].reshape(len(still), -1, scale)
+            response[across.any(axis=2)] = 0
         around = shape.centre if level else _APART // scale
         column, value = _strongest(response, count, scale, limits, around, min_snr * unit)
         columns.append(column)

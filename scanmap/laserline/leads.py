@@ -34,6 +34,7 @@ class Leads(NamedTuple):
     column: F32  # [px] to a pixel or two
     height: F32  # over the brighter of its two sides [grey levels]
     rival: F32  # the highest elsewhere in the block [grey levels]
+    beside: F32  # where that is [px]
 
 
 def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
@@ -49,21 +50,24 @@ def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
     at = response.argmax(axis=1)
     column = (scale * (at + _EDGE) + 0.5 * (scale - 1)).astype(np.float32)
     height = response[index, at] * np.float32(1.0 / (_CENTRE * scale))
-    rival = _highest_elsewhere(response, at, scale)
+    rival, beside = _highest_elsewhere(response, at, scale)
     sums, scale = _halved(sums), 2 * scale
     if sums.shape[1] > 2 * _EDGE + 2:
         response = _allowed(_stands_out(sums), scale, limits)
-        np.maximum(rival, _highest_elsewhere(response, (at + _EDGE) // 2 - _EDGE, scale), out=rival)
-    return Leads(column, height, rival)
+        other, place = _highest_elsewhere(response, (at + _EDGE) // 2 - _EDGE, scale)
+        beside = np.where(other > rival, place, beside)
+        np.maximum(rival, other, out=rival)
+    return Leads(column, height, rival, beside)
 
 
-def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> F32:
-    """The highest response (B,) of each block apart from the place `at` (B,) [grey levels]."""
+def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> tuple[F32, F32]:
+    """The highest response (B,) of each block apart from the place `at` (B,) [grey levels], and its column [px]."""
     length = min(2 * max(int(_APART_PX) // scale, _CENTRE + 1) + 1, response.shape[1])
-    runs = runs_in(response, length)
-    runs[np.arange(len(at)), np.minimum(np.maximum(at - length // 2, 0), runs.shape[1] - 1)] = 0
-    highest: F32 = response.max(axis=1) * np.float32(1.0 / (_CENTRE * scale))
-    return highest
+    runs, index = runs_in(response, length), np.arange(len(at))
+    runs[index, np.minimum(np.maximum(at - length // 2, 0), runs.shape[1] - 1)] = 0
+    place = response.argmax(axis=1)
+    highest: F32 = response[index, place] * np.float32(1.0 / (_CENTRE * scale))
+    return highest, (scale * (place + _EDGE) + 0.5 * (scale - 1)).astype(np.float32)
 
 
 def settled(leads: Leads, noise: float, min_snr: float) -> Mask:

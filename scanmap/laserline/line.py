@@ -22,9 +22,9 @@ from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import TELLING, pool, segments, unexplained
-from scanmap.laserline.result import LaserLine, Reason, no_line, without
+from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
 from scanmap.laserline.samples import by_width, samples_of
-from scanmap.laserline.search import search
+from scanmap.laserline.search import Course, search
 from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
 
 Array = NDArray[np.float64]
@@ -101,28 +101,46 @@ def find_laser_line(
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
     """
+    return look(image, params, background, window).line
+
+
+def look(
+    image: U8,
+    params: LaserLineParams,
+    background: U8 | None = None,
+    window: Array | None = None,
+    still: NDArray[np.bool_] | None = None,
+) -> Look:
+    """Locate the laser line as `find_laser_line` does, and all else that looks like one.
+
+    Args:
+        still: (ceil(H / BLOCK), W) where things of the room are known to be, in blocks of rows; the line is looked
+            for everywhere else.
+    """
     if image.strides[1:] != (1, 1)[: image.ndim - 1] and image.strides[1:] != (image.shape[-1], 1):
         image = np.ascontiguousarray(image)
     if window is None:
         window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
     if params.method == "brightest":
         channel = channel_of(image, background, params.grey)[0] if image.ndim == 3 else None
-        return _brightest(to_grey(image, params.grey, params.bit_index, channel), params, window)
+        return Look(_brightest(to_grey(image, params.grey, params.bit_index, channel), params, window))
     if not np.isfinite(window).any():
-        return no_line(len(image), Reason.WINDOW)
+        return Look(no_line(len(image), Reason.WINDOW))
     # Everything below sees only the columns in question; in fours, which are summed in pairs and those again.
     left = max(0, int(np.nanmin(window)) - _MARGIN) // 4 * 4
     image = image[:, left : left + -(-(int(np.nanmax(window)) + _MARGIN + 1 - left) // 4) * 4]
     background = None if background is None else background[:, left : left + image.shape[1]]
-    line = _found(image, params, background, window - left)
-    line.column_px[:] += left
-    return line
-
-
-def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Array) -> LaserLine:
+    still = None if still is None else still[:, left : left + image.shape[1]]
     sight = sight_of(image, background, Conversion(params.grey, params.bit_index, params.off_threshold))
+    course = search(sight, window - left, params.min_snr, still)
+    line = _found(sight, course, params, window - left)
+    line.column_px[:] += left
+    # What does not change with the laser is gone already where there is a laser-off frame.
+    return Look(line, course.places + np.float32(left) if background is None else None)
+
+
+def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:
     noise = sight.noise
-    course = search(sight, window, params.min_snr)
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
     line = _located(sight, (row, column), params)
     _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
@@ -135,7 +153,7 @@ def _found(image: U8, params: LaserLineParams, background: U8 | None, window: Ar
         y, _ = samples_of(sight, *at).of(_CORE_HALF, slice(None))
         _take_cores(line, at, y.T, widest, noise, params)
     if sight.image is not None:
-        pure = np.repeat(course.pure, BLOCK)[: len(image)]
+        pure = np.repeat(course.pure, BLOCK)[: len(sight.lit)]
         line = without(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
     if sight.off is None and params.method == "gauss":
         line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane), Reason.WIDE)

@@ -59,6 +59,15 @@ class LaserLine(NamedTuple):
     reason: NDArray[np.uint8]  # (H,) Reason: OK, or why the row has no line
 
 
+class Look(NamedTuple):
+    """One picture's laser line, and whatever else in it could be taken for one."""
+
+    line: LaserLine  # (H,)
+    # (ceil(H / 8), n) [px] line-like places in every other block of 4 rows, NaN where there are fewer; None where the
+    # laser-off frame has told them from the line.
+    places: NDArray[np.float32] | None = None
+
+
 def no_line(height: int, reason: Reason) -> LaserLine:
     """A line of `height` rows that has none."""
     column, peak, width, sigma = (np.full(height, np.nan) for _ in range(4))

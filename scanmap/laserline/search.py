@@ -35,31 +35,42 @@ class Course(NamedTuple):
 
     column: F32  # [px] NaN where there is none
     pure: Mask  # of the laser's colour beyond doubt
+    places: F32  # (ceil(B / 2), n) [px] all that looks like a line in every other block, NaN where nothing more does
 
 
-def search(sight: Sight, window: F64, min_snr: float) -> Course:
+def search(sight: Sight, window: F64, min_snr: float, still: Mask | None = None) -> Course:
     """The line's column in each block of rows.
 
     Args:
         window: (H, 2) first and last column of each row, NaN where a row can have no line.
         min_snr: least signal to noise of a place that can be the line.
+        still: (B, W) where things of the room are known to be; nothing there is taken for the line.
     """
-    if not is_large(sight.lit):
+    if still is not None or not is_large(sight.lit):
+        large = is_large(sight.lit)
         other = None if sight.image is None else blocks_of(sight.image, NEIGHBOUR[sight.channel])
-        found = find_candidates(sight.lit, window, sight.noise, min_snr, other)
+        found = find_candidates(sight.lit, window, sight.noise, min_snr, other, large, still)
         path = choose_path(found, _scores(sight, found, np.full(len(found.snr), np.nan, np.float32)), min_snr)
-        return Course(path, np.zeros(len(path), bool))
-    found, shares = _settled(sight, window, min_snr)
+        return Course(path, np.zeros(len(path), bool), _places(found, min_snr))
+    found, shares, beside = _settled(sight, window, min_snr)
     good = found.snr[:, 0] > 0
     rest = (~good).nonzero()[0]
     if not rest.size:
-        return Course(choose_path(found, found.snr, min_snr), good)
+        return Course(choose_path(found, found.snr, min_snr), good, np.hstack([_places(found, min_snr), beside]))
     found = _with_blocks(found, rest, _all_candidates(sight, rest, window, min_snr))
-    return Course(choose_path(found, _scores(sight, found, shares), min_snr), good)
+    path = choose_path(found, _scores(sight, found, shares), min_snr)
+    return Course(path, good, np.hstack([_places(found, min_snr), beside]))
 
 
-def _settled(sight: Sight, window: F64, min_snr: float) -> tuple[Candidates, F32]:
+def _places(found: Candidates, min_snr: float) -> F32:
+    """The candidates' columns in every other block, NaN where they are none."""
+    return np.where(found.snr[::2] >= min_snr, found.column[::2], np.float32(np.nan))
+
+
+def _settled(sight: Sight, window: F64, min_snr: float) -> tuple[Candidates, F32, F32]:
     """The only candidate (B, 1) of each block that a quick look settles, and its share in other channels (B,).
+
+    And the column (ceil(B / 2), 1) of what comes next to it in every other block, NaN where nothing does.
 
     A row of every other block is looked at; in the blocks between, the line must go on as high.
     """
@@ -83,7 +94,9 @@ def _settled(sight: Sight, window: F64, min_snr: float) -> tuple[Candidates, F32
     column[odd], shares[odd] = at, 0.5 * (known[both] + known[after[both]])
     height[odd] = np.where(response > _GOES_ON * least, response, np.float32(0.0))
     shares[height == 0] = np.nan
-    return Candidates(column[:, None], (height / np.float32(unit_of(sight.noise, True)))[:, None]), shares
+    unit = np.float32(unit_of(sight.noise, True))
+    beside = np.where(leads.rival >= min_snr * unit, leads.beside, np.float32(np.nan))
+    return Candidates(column[:, None], (height / unit)[:, None]), shares, beside[:, None]
 
 
 def _all_candidates(sight: Sight, blocks: Index, window: F64, min_snr: float) -> Candidates:

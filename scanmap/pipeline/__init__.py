@@ -2,6 +2,7 @@
 
 from scanmap.pipeline.processes import Processes, worth_processes
 from scanmap.pipeline.running import Runner, checked, run
+from scanmap.pipeline.second_look import SecondLook
 from scanmap.pipeline.step import Pipeline, Sink, Step
 
-__all__ = ["Pipeline", "Processes", "Runner", "Sink", "Step", "checked", "run", "worth_processes"]
+__all__ = ["Pipeline", "Processes", "Runner", "SecondLook", "Sink", "Step", "checked", "run", "worth_processes"]

@@ -20,6 +20,9 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import IO, NamedTuple, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from scanmap.laserline import LaserLine
 from scanmap.pipeline.running import run_groups
 from scanmap.pipeline.step import Pipeline, Sink, Step
@@ -62,6 +65,7 @@ class Answer(NamedTuple):
     line: LaserLine | None = None
     profile: Profile | None = None
     fault: str = ""
+    places: NDArray[np.float32] | None = None
     error: Exception | None = None
 
 
@@ -133,7 +137,7 @@ def _steps(shots: list[Shot], answers: list[Answer]) -> Iterator[Step]:
     for shot, answer in zip(shots, answers, strict=True):
         if answer.line is None or answer.profile is None:
             raise answer.error or RuntimeError("a worker process answered nothing")
-        yield Step(shot, answer.line, answer.profile, answer.fault)
+        yield Step(shot, answer.line, answer.profile, answer.fault, answer.places)
 
 
 class _Worker:
@@ -216,6 +220,6 @@ def serve(messages: IO[bytes], answers: IO[bytes]) -> None:
 def _answer(pipeline: Pipeline, shot: Shot) -> Answer:
     try:
         step = pipeline.process(shot)
-        return Answer(step.line, step.profile, step.fault)
+        return Answer(step.line, step.profile, step.fault, step.places)
     except Exception as error:
         return Answer(error=error)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
 from scanmap.errors import CameraError
-from scanmap.laserline import LaserLine, LaserLineParams, Reason, find_laser_line, needs_colour
+from scanmap.laserline import LaserLine, LaserLineParams, Reason, look, needs_colour
 from scanmap.shot import Decoded, Shot, decode_image
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
 
@@ -22,6 +22,7 @@ class Step(NamedTuple):
     line: LaserLine  # (H,)
     profile: Profile  # (H,) head frame
     fault: str = ""  # what was wrong with the image; empty when nothing was
+    places: NDArray[np.float32] | None = None  # all that looks like a line, as `Look` has it
 
 
 Sink = Callable[[Step], None]
@@ -48,20 +49,25 @@ class Pipeline:
         self.window += np.array([-slack_px, slack_px])
         self.colour = needs_colour(laserline)  # whether the line is found in colour or a grey decode will do
 
-    def process(self, shot: Shot) -> Step:
-        """Decode, find the line, triangulate. A bad image gives a Step without points and its fault."""
+    def process(self, shot: Shot, still: NDArray[np.bool_] | None = None) -> Step:
+        """Decode, find the line, triangulate. A bad image gives a Step without points and its fault.
+
+        Args:
+            still: where things of the room are known to be, as `laserline.look` takes it.
+        """
         try:
             image = self._decode(shot.image)
             background = self._decode(shot.background) if shot.background is not None else None
         except CameraError as error:
             return self._blind(shot, str(error))
-        line = find_laser_line(image.image, self.laserline, background.image if background else None, self.window)
+        dark = background.image if background else None
+        line, places = look(image.image, self.laserline, dark, self.window, still)
         fault = ""
         rows = min(image.rows_valid, background.rows_valid if background else image.rows_valid)
         if rows < len(line.reason):
             line = _without_rows(line, rows)
             fault = f"image is cut: {rows} of {len(line.reason)} rows are whole"
-        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault)
+        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, places)
 
     def _decode(self, data: bytes) -> Decoded:
         decoded = decode_image(data, grey=not self.colour)

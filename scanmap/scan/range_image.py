@@ -20,6 +20,9 @@ F32 = NDArray[np.float32]
 class ScanParams(BaseModel, frozen=True, extra="forbid"):
     """What happens to the range image before it is written; `[scan]` in a rig's TOML."""
 
+    second_look: bool = Field(
+        True, description="after the sweep, look again where a thing that stands still was taken for the line"
+    )
     filter_outliers: bool = Field(True, description="remove points that no neighbour in the range image supports")
     merge_deg: float = Field(0.02, ge=0, description="bearings closer than this are one column [deg]")
     support_px: float = Field(
@@ -78,6 +81,19 @@ class Scan:
         for name in ("range_m", "sigma_m", "intensity", "column_px", "reason"):
             self._fields[name][k] = getattr(profile, name)
         self._count += 1
+
+    def amend(self, k: int, rows: NDArray[np.bool_], profile: Profile) -> None:
+        """Replace the cells `rows` (H,) of the k-th bearing by those of another profile seen there."""
+        self._fields["points"][k, rows] = transform(self.mount.T_world_head(self.bearings[k]), profile.points[rows])
+        for name in ("range_m", "sigma_m", "intensity", "column_px", "reason"):
+            self._fields[name][k, rows] = getattr(profile, name)[rows]
+
+    def give_up(self, mask: NDArray[np.bool_], reason: Reason) -> None:
+        """Take the points of the cells `mask` (B, H) away, in place, for `reason`."""
+        lost = mask & self.valid
+        self.reason[lost] = reason
+        for name in ("points", "range_m", "sigma_m", "intensity", "column_px"):
+            self._view(name)[lost] = np.nan
 
     def __len__(self) -> int:
         """Number of bearings B."""
@@ -157,10 +173,7 @@ class Scan:
     def without(self, mask: NDArray[np.bool_], reason: Reason) -> Scan:
         """A copy in which the cells of `mask` (B, H) have no point any more, for `reason`."""
         copy = self.taken(np.arange(self._count))
-        lost = mask & copy.valid
-        copy._fields["reason"][lost] = reason
-        for name in ("points", "range_m", "sigma_m", "intensity", "column_px"):
-            copy._fields[name][lost] = np.nan
+        copy.give_up(mask, reason)
         return copy
 
     def taken(self, order: NDArray[np.intp]) -> Scan:

@@ -18,12 +18,13 @@ from scanmap.config import Config
 from scanmap.errors import RecordingError, ScanmapError
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import Reason
-from scanmap.pipeline import Pipeline, Processes, Runner, Sink, Step, checked, run, worth_processes
+from scanmap.pipeline import Pipeline, Processes, Runner, SecondLook, Sink, Step, checked, run, worth_processes
 from scanmap.recording import Recorder
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
 from scanmap.session.outputs import Outputs, write_results
 from scanmap.session.refining import Refinement
+from scanmap.session.settling import read_again, settle
 from scanmap.session.summary import Summary, summarise
 from scanmap.shot import Shot, Withdrawal
 from scanmap.twin import Truth, TruthReport
@@ -116,7 +117,8 @@ class Job:
         error: Exception | None = None
         try:
             pipeline = Pipeline(self.calibration, self.config.laserline, self.config.triangulation)
-            sinks = self._sinks(scan, progress)
+            second_look = SecondLook(pipeline)
+            sinks: list[Sink] = [*self._sinks(scan, progress), second_look]
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
             with closing(self._recorded()) as shots, self.runner(pipeline) as run_shots:
                 run_shots(checked(shots, self.calibration), sinks=sinks, stop=stop)
@@ -138,6 +140,9 @@ class Job:
             if ended == "interrupted":
                 raise KeyboardInterrupt
             raise RecordingError("; ".join(["there is no shot to make a scan of", *self.source_faults[:1]]))
+        if self.config.scan.second_look:
+            own = self.shots if self.recorded else None
+            self.faults += settle(second_look, scan, [self.earlier, read_again(self.recorder) or own], self._withdrawn)
         return self._finished(scan, ended, error)
 
     def withdraw(self, indices: Collection[int], why: Withdrawal) -> None:

@@ -1,0 +1,257 @@
+"""What stands still while the head turns is not the laser line: geometry, and whole sweeps of drawn pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scanmap.calibration import Calibration, CalibrationFile, HeadTable, ImageTable
+from scanmap.calibration.file import AxisTable
+from scanmap.geometry import inverse, transform
+from scanmap.laserline import LaserLineParams, Reason
+from scanmap.pipeline import Pipeline, SecondLook, run
+from scanmap.pipeline.still import FIRST, ROWS, StillThings
+from scanmap.scan import Scan
+from scanmap.shot import Shot
+from scanmap.triangulation import TriangulationParams, column_window
+
+F64 = NDArray[np.float64]
+
+WIDTH, HEIGHT = 640, 240
+STEP = np.radians(6.0)
+BEARINGS = np.arange(0, 24) * STEP
+WALL_Y = 2.0  # the only wall, y = 2 in the world, right across the sweep
+BRIGHT, TUBE = 90.0, 190.0  # [grey levels] of the line and of the tube
+
+
+def head(offset: tuple[float, float, float] = (0.03, 0.01, 0.0)) -> Calibration:
+    return CalibrationFile(
+        image=ImageTable(width=WIDTH, height=HEIGHT),
+        head=HeadTable(baseline_m=0.2, beta_deg=22.0, alpha_deg=30.0),
+        axis=AxisTable(head_offset_m=offset, tilt_deg=(0.3, -0.2)),
+    ).build()
+
+
+def seen(calibration: Calibration, bearing: float, points: F64) -> F64:
+    """Pixels (N, 2) of world points, NaN outside the picture."""
+    T = calibration.mount.T_world_head(bearing) @ calibration.T_head_camera
+    pixel = calibration.intrinsics.project(transform(inverse(T), points))
+    inside = ((pixel > 1) & (pixel < [WIDTH - 2, HEIGHT - 2])).all(axis=1)
+    pixel[~inside] = np.nan
+    return pixel
+
+
+def line_on_wall(calibration: Calibration, bearing: float) -> F64:
+    """Columns (H,) of the laser line on the wall."""
+    T = calibration.mount.T_world_head(bearing)
+    angle = np.radians(np.linspace(-40.0, 40.0, 4000))
+    way = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1) @ T[:3, :3].T
+    reach = (WALL_Y - T[1, 3]) / way[:, 1]
+    met = way[:, 1] > 0.2
+    pixel = seen(calibration, bearing, (T[:3, 3] + reach[:, None] * way)[met])
+    known = pixel[np.isfinite(pixel[:, 0])]
+    if len(known) < 2:
+        return np.full(HEIGHT, np.nan)
+    order = np.argsort(known[:, 1])
+    return np.interp(np.arange(HEIGHT), known[order, 1], known[order, 0], left=np.nan, right=np.nan)
+
+
+def tube(x: float, y: float, low: float = -0.4, high: float = 0.4) -> F64:
+    return np.stack([np.full(600, x), np.full(600, y), np.linspace(low, high, 600)], axis=1)
+
+
+def places_of(calibration: Calibration, bearing: float, things: list[F64]) -> NDArray[np.float32]:
+    """What `laserline.look` would list: the line on the wall, and the things."""
+    rows = np.arange(FIRST, HEIGHT, ROWS)
+    found = [line_on_wall(calibration, bearing)[rows]]
+    for thing in things:
+        pixel = seen(calibration, bearing, thing)
+        column = np.full(len(rows), np.nan)
+        pixel = pixel[np.isfinite(pixel[:, 0])]
+        if len(pixel) > 1:
+            order = np.argsort(pixel[:, 1])
+            column = np.interp(rows, pixel[order, 1], pixel[order, 0], left=np.nan, right=np.nan)
+        found.append(column)
+    return np.stack(found, axis=1).astype(np.float32)
+
+
+def collected(calibration: Calibration, things: list[F64], bearings: F64 = BEARINGS) -> StillThings:
+    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
+    for bearing in bearings:
+        still.add(float(bearing), places_of(calibration, float(bearing), things))
+    return still
+
+
+def asked(calibration: Calibration, still: StillThings, bearing: float, column: F64) -> NDArray[np.bool_]:
+    """What `still` says of columns (ceil(H / ROWS),) taken for the laser line."""
+    rows = np.arange(FIRST, HEIGHT, ROWS)
+    rays = calibration.intrinsics.rays(column, rows.astype(np.float64)) @ calibration.T_head_camera[:3, :3].T
+    camera = calibration.T_head_camera[:3, 3]
+    points = camera - (camera[1] / rays[:, 1])[:, None] * rays  # the laser plane is y = 0
+    distance = np.hypot(*transform(calibration.mount.T_axis_head(), points)[:, :2].T)
+    return still.stands(np.full(len(rows), bearing), rows, column, distance)
+
+
+def test_a_tube_stands_and_the_line_does_not() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still = collected(calibration, [lamp])
+    assert still.count()
+    tubes = lines = rows = 0
+    for bearing in BEARINGS:
+        line, thing = places_of(calibration, float(bearing), [lamp]).astype(np.float64).T
+        found = np.isfinite(line)
+        rows += int(found.sum())
+        lines += int(asked(calibration, still, float(bearing), np.where(found, line, 100.0))[found].sum())
+        far = np.isfinite(thing) & (thing > 250.0)  # columns of points nearer than half the wall's distance
+        if far.any():
+            tubes += 1
+            assert asked(calibration, still, float(bearing), np.where(far, thing, 300.0))[far].mean() > 0.9
+    assert tubes >= 4
+    assert lines < 0.01 * rows
+
+
+def test_where_the_laser_meets_the_thing_itself_it_is_kept() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still = collected(calibration, [lamp])
+    still.count()
+    # The bearing at which the laser's plane passes through the tube: there its column is the laser's own.
+    own = min(
+        np.linspace(1.0, 1.6, 6001), key=lambda b: abs(inverse(calibration.mount.T_world_head(b))[1] @ [*lamp[300], 1])
+    )
+    thing = places_of(calibration, float(own), [lamp])[:, 1].astype(np.float64)
+    known = np.isfinite(thing)
+    assert known.sum() > 10
+    inner = np.flatnonzero(known)[2:-2]  # at its ends fewer bearings see it
+    assert not asked(calibration, still, float(own), np.where(known, thing, 0.0))[inner].any()
+
+
+def test_a_thing_seen_twice_proves_nothing() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
+    for bearing in BEARINGS[9:11]:
+        still.add(float(bearing), places_of(calibration, float(bearing), [lamp])[:, 1:])
+    assert not still.count()
+
+
+def test_a_second_turn_is_no_other_view() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
+    for turn in range(4):
+        still.add(float(BEARINGS[9] + 2.0 * np.pi * turn), places_of(calibration, float(BEARINGS[9]), [lamp])[:, 1:])
+    assert not still.count()
+
+
+def test_the_mask_covers_the_thing_at_every_bearing_and_little_else() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still = collected(calibration, [lamp])
+    still.count()
+    for bearing in BEARINGS[4:12]:
+        mask = still.mask(float(bearing), 4)
+        assert mask.shape == (HEIGHT // 4, WIDTH)
+        pixel = np.rint(seen(calibration, float(bearing), lamp))
+        pixel = pixel[np.isfinite(pixel[:, 0])].astype(int)
+        if len(pixel):
+            assert mask[pixel[:, 1] // 4, pixel[:, 0]].mean() > 0.9
+        assert mask.mean() < 0.12
+
+
+def drawn(calibration: Calibration, bearing: float, things: list[F64], level: float, rng: np.random.Generator) -> bytes:
+    """A grey picture of the wall's line and of things as bright as `level`."""
+    x = np.arange(WIDTH)
+    picture = rng.normal(20.0, 2.0, (HEIGHT, WIDTH))
+    line = line_on_wall(calibration, bearing)
+    for row in np.flatnonzero(np.isfinite(line)):
+        picture[row] += BRIGHT * np.exp(-0.5 * ((x - line[row]) / 1.5) ** 2)
+    for thing in things:
+        pixel = seen(calibration, bearing, thing)
+        pixel = pixel[np.isfinite(pixel[:, 0])]
+        order = np.argsort(pixel[:, 1])
+        if len(pixel) > 1:
+            rows = np.arange(int(np.ceil(pixel[:, 1].min())), int(pixel[:, 1].max()) + 1)
+            for row, column in zip(rows, np.interp(rows, pixel[order, 1], pixel[order, 0]), strict=True):
+                picture[row] += level * np.exp(-0.5 * ((x - column) / 1.5) ** 2)
+    return bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
+
+
+def swept(
+    calibration: Calibration, things: list[F64], level: float = TUBE, order: list[int] | None = None
+) -> tuple[Scan, SecondLook, list[Shot]]:
+    rng = np.random.default_rng(3)
+    shots = [
+        Shot(k, float(b), float(b), float(k), drawn(calibration, float(b), things, level, rng), None)
+        for k, b in enumerate(BEARINGS)
+    ]
+    shots = [shots[k] for k in order] if order else shots
+    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
+    scan, second = Scan(calibration.mount, HEIGHT), SecondLook(pipeline)
+    run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second], workers=1)
+    return scan, second, shots
+
+
+def off_the_wall(scan: Scan) -> NDArray[np.int64]:
+    """Points that are not on the wall, (B,)."""
+    with np.errstate(invalid="ignore"):
+        off: NDArray[np.int64] = (np.abs(scan.points[..., 1] - WALL_Y) > 0.1).sum(axis=1)
+    return off
+
+
+def test_tubes_brighter_than_the_line_cost_few_points() -> None:
+    calibration = head()
+    clean = int(swept(calibration, [])[0].valid.sum())
+    scan, second, shots = swept(calibration, [tube(0.6, 1.9), tube(0.1, 1.8)])
+    assert off_the_wall(scan).sum() > 0.3 * clean  # one picture cannot tell
+    assert second.settle(scan, lambda: shots) > 0.3 * clean
+    # Where the laser is about to meet the thing itself the two are hard to tell apart; and a tube has ends.
+    assert np.sort(off_the_wall(scan))[-2] <= 20
+    assert off_the_wall(scan).sum() < 0.05 * clean
+    assert scan.valid.sum() > 0.93 * clean
+
+
+def test_without_the_pictures_points_are_given_up() -> None:
+    scan, second, _ = swept(head(), [tube(0.6, 1.9), tube(0.1, 1.8)])
+    before, false = int(scan.valid.sum()), int(off_the_wall(scan).sum())
+    given_up = second.settle(scan, None)
+    assert off_the_wall(scan).sum() < 0.1 * false
+    assert int(scan.valid.sum()) == before - given_up
+    assert (scan.reason == Reason.AMBIGUOUS).sum() >= given_up
+
+
+def test_a_sweep_without_such_things_stays_as_it_is() -> None:
+    scan, second, shots = swept(head(), [])
+    before = scan.taken(np.arange(len(scan)))
+    assert second.settle(scan, lambda: shots) == 0
+    np.testing.assert_array_equal(scan.points, before.points)
+    np.testing.assert_array_equal(scan.reason, before.reason)
+
+
+def test_the_order_of_the_shots_does_not_matter() -> None:
+    things = [tube(0.6, 1.9), tube(0.1, 1.8)]
+    order = [int(k) for k in np.random.default_rng(1).permutation(len(BEARINGS))]
+    (one, first, shots), (other, second, mixed) = swept(head(), things), swept(head(), things, order=order)
+    first.settle(one, lambda: shots)
+    second.settle(other, lambda: mixed)
+    np.testing.assert_array_equal(one.merged().points, other.merged().points)
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_what_returns_less_light_than_any_surface_is_not_the_line(lit: bool) -> None:
+    """A dim thing in one picture only, where the line is lost, at a column that means 0.3 m."""
+    calibration = head((0.0, 0.0, 0.0))
+    scan, second, shots = swept(calibration, [])
+    k, rows = 8, slice(60, 180)
+    rng = np.random.default_rng(5)
+    picture = rng.normal(20.0, 2.0, (HEIGHT, WIDTH))
+    height = 180.0 if lit else 25.0
+    picture[rows] += height * np.exp(-0.5 * ((np.arange(WIDTH) - 560.0) / (4.0 if lit else 1.2)) ** 2)
+    image = bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
+    odd = Shot(99, float(BEARINGS[k] + 0.5 * STEP), 0.0, 99.0, image, None)
+    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
+    step = pipeline.process(odd)
+    assert np.isfinite(step.profile.range_m[rows]).mean() > 0.9
+    assert np.nanmax(step.profile.range_m) < 0.4
+    scan.add(step.profile, odd.bearing)
+    second(step)
+    second.settle(scan, lambda: [*shots, odd])
+    assert scan.valid[-1].any() == lit
