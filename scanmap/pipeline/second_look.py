@@ -87,13 +87,14 @@ class SecondLook:
     def _wrong(self, scan: Scan, asked: NDArray[np.intp], usual: float) -> Mask:
         """Cells (B, H) of the bearings `asked` that are not the line."""
         wrong = np.zeros((len(scan), scan.rows), bool)
+        valid = scan.valid
         for k in asked:
             with np.errstate(invalid="ignore"):
-                wrong[k] = scan.valid[k] & (self._reflectance[k] < _DIM * usual)
+                wrong[k] = valid[k] & (self._reflectance[k] < _DIM * usual)
         if not self._still.count():
             return wrong
         column = scan.column_px[asked, FIRST::ROWS]
-        i, j = np.nonzero(scan.valid[asked, FIRST::ROWS])
+        i, j = np.nonzero(valid[asked, FIRST::ROWS])
         row = j * ROWS + FIRST
         distance = np.hypot(*np.moveaxis(scan.points[asked[i], row, :2], -1, 0)).astype(np.float64)
         stands, known, close = (np.zeros(column.shape, np.float32) for _ in range(3))
@@ -104,7 +105,7 @@ class SecondLook:
             if values.any():
                 near, all_near = (np.convolve(v, together, "same") for v in (values, have))
                 still = (near >= _MOSTLY * all_near) & (near >= np.where(nearby > 0, _AGREE_CLOSE, _AGREE))
-                wrong[k] |= _over_rows(still, scan.column_px[k]) & scan.valid[k]
+                wrong[k] |= _over_rows(still, scan.column_px[k]) & valid[k]
         return wrong
 
     def _mask(self, scan: Scan, k: int, wrong: Mask) -> Mask:
