@@ -113,7 +113,7 @@ def test_a_shift_between_two_photographs_is_measured(data, down, right):
 def test_the_lasers_channel_is_told_on_a_white_board_in_a_bright_room(data):
     files = sorted((data / "real" / "srv-calib" / "laser").glob("*.jpg"))[::4]
     channels = [laser_channel(np.asarray(cv2.imread(str(file)), np.uint8)) for file in files]
-    assert np.mean(np.array(channels) == 1) >= 0.95
+    assert np.mean(np.array(channels) == 1) >= 0.96
 
 
 def boards_found(data, numbers, params, change=None):
@@ -132,12 +132,52 @@ def boards_found(data, numbers, params, change=None):
     return (*found / carry, astray / (480 * len(numbers)))
 
 
-@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.9, 0.03), ("green", 0.93, 0.01)])
+@pytest.mark.parametrize(("grey", "least", "most_astray"), [("auto", 0.93, 0.01), ("green", 0.93, 0.01)])
 def test_a_line_on_white_boards_before_a_cabinet_full_of_things(data, grey, least, most_astray):
     on_board, beside, astray = boards_found(data, board_lines.NUMBERS[::4], LaserLineParams(grey=grey))
     assert on_board >= least
     assert beside >= 0.55
     assert astray <= most_astray
+
+
+# What other cameras make of the same room: share of the rows found on the boards at least, and elsewhere at most.
+CAMERAS = {
+    "darker": (brightened(0.7, 0.7, 0.7), 0.88, 0.01),
+    "warmer": (brightened(0.8, 1.0, 1.2), 0.9, 0.03),
+    "colder": (brightened(1.2, 1.0, 0.8), 0.85, 0.06),
+    "gamma 0.8": (bent(0.8), 0.95, 0.02),
+    "gamma 1.25": (bent(1.25), 0.9, 0.03),
+    "red laser": (lambda image: np.ascontiguousarray(image[..., [0, 2, 1]]), 0.93, 0.01),
+    "blue laser": (lambda image: np.ascontiguousarray(image[..., [1, 0, 2]]), 0.93, 0.04),
+}
+
+
+@pytest.mark.parametrize("camera", sorted(CAMERAS))
+def test_boards_seen_by_other_cameras(data, camera):
+    change, least, most_astray = CAMERAS[camera]
+    on_board, _, astray = boards_found(data, board_lines.NUMBERS[::6], GAUSS, change)
+    assert on_board >= least
+    assert astray <= most_astray
+
+
+def test_columns_of_the_sensor_that_are_always_white_are_no_line(data):
+    def with_faults(image):
+        faulty = image.copy()
+        faulty[:, [300, 501, 502]] = 255
+        return faulty
+
+    on_board, _, astray = boards_found(data, board_lines.NUMBERS[::6], GAUSS, with_faults)
+    assert on_board >= 0.8
+    assert astray <= 0.03
+
+
+def test_a_picture_that_was_cut_short_has_the_line_where_it_has_rows(data):
+    image = board_lines.picture(data / "real" / "srv-calib" / "laser", 45)
+    # What decoders that do not refuse such pictures fill them up with.
+    image[200:] = 128
+    off = np.abs(find_laser_line(image, GAUSS).column_px - board_lines.marked(45)[0])
+    assert np.mean(off[:200] <= 4.0) >= 0.97
+    assert np.isnan(off[204:]).all()
 
 
 def test_a_thin_line_on_white_plaster_in_a_bright_room(data):

@@ -22,6 +22,7 @@ _BLAZING, _ALONE = 240, 100  # [grey levels] of a channel, and above the other t
 # elsewhere, in such places; columns a row that a line runs at most.
 _ENOUGH, _JUMP, _STEEP = 30, 2, 1.0
 _MANY = 0.3  # share of the rows
+_DARK, _TINT = 12, 0.5  # [grey levels] of a dark room; the least factor that brings a channel's light to grey
 
 
 def laser_channel(image: U8) -> int:
@@ -45,7 +46,8 @@ def judged_channel(image: U8, background: U8 | None = None) -> tuple[int, bool]:
         step = max(1, len(image) // pairs)
         above, below = (_every(step, first, image, background) for first in (0, min(2, len(image) - 1)))
         n = len(below)
-        planes = _planes(np.concatenate([above[:n], below]))
+        both_rows = np.concatenate([above[:n], below])
+        planes = _planes(both_rows if background is not None else _neutral(both_rows))
         rows = [plane[:n] for plane in planes]
         blazing = _blazing_channel(rows)
         if blazing is not None:
@@ -67,6 +69,16 @@ def judged_channel(image: U8, background: U8 | None = None) -> tuple[int, bool]:
     else:
         strength = [rare * chain for rare, chain in zip(_USUAL, _chains(both.reshape(3, n, -1), step), strict=True)]
     return int(np.argmax(strength)), False
+
+
+def _neutral(rows: U8) -> U8:
+    """Rows (n, W, 3) with the room's usual colour taken for grey: what is white in coloured light is not coloured.
+
+    The median, which the line's own light does not reach, of a dark room hardly counts. Source: Buchsbaum 1980.
+    """
+    usual = np.median(rows[:, ::8].reshape(-1, 3), axis=0) + _DARK
+    factor = np.clip(usual.min() / usual, _TINT, 1.0)
+    return np.asarray(cv2.transform(rows, np.diag(factor).astype(np.float32)), np.uint8)
 
 
 def _every(step: int, first: int, image: U8, background: U8 | None) -> U8:

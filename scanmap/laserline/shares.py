@@ -71,6 +71,8 @@ def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = Fals
     rises = [np.where(clear[side], own[side] - own[side].min(axis=0), 0.0) for side in sides]
     left, right = rises[0].argmax(axis=0), rises[1].argmax(axis=0) + half
     hidden = np.minimum(rises[0].max(axis=0), rises[1].max(axis=0)) < _FLANK
+    # A column of the sensor that is always white has none: every beam does.
+    fault = hidden & (own[half] - np.max(own[[0, 1, -2, -1]], axis=0) > 2 * _FLANK)
     light = y[left, :, index] + y[right, :, index]
     near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
     # All of a side, for colour is smeared.
@@ -82,7 +84,8 @@ def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = Fals
     for light_there in total if purer_side else [total[0] + total[1]]:
         share = np.maximum(light_there[others[0]], light_there[others[1]]) / np.maximum(light_there[channel], 1.0)
         beyond = np.where(light_there[channel] > _FLANK, np.maximum(beyond, 1.0 - share), beyond)
-    return np.where(hidden, 1.0, near).astype(np.float32), np.where(hidden, 1.0, beyond).astype(np.float32)
+    near, beyond = (np.where(fault, 0.0, np.where(hidden, 1.0, lead)).astype(np.float32) for lead in (near, beyond))
+    return near, beyond
 
 
 def across(image: U8, row: Index, column: Index) -> NDArray[np.int16]:
