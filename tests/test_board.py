@@ -183,6 +183,12 @@ def test_a_hand_on_a_chessboard_costs_the_corners_under_it(chess) -> None:
     assert np.linalg.norm(view.corners[:, None] - truth, axis=-1).min(axis=1).max() < 0.3
 
 
+def test_a_charuco_board_is_not_taken_for_a_chessboard(charuco) -> None:
+    found = collect([Picture("one", charuco)], CHESS)
+    with pytest.raises(CalibrationError, match="use --board such as charuco:7x5:30mm"):
+        found.require()
+
+
 def test_views_that_show_only_parts_ask_for_the_whole(chess) -> None:
     cut = np.ascontiguousarray(chess[:, 290:])
     found = collect([Picture("one", cut)], CHESS)

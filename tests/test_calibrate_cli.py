@@ -103,6 +103,25 @@ def test_a_scan_refuses_a_calibration_without_a_laser_plane(run: Run) -> None:
 
 
 @pytest.mark.slow
+def test_a_wrong_picture_among_good_ones_is_named_and_another_length_is_doubted(run: Run) -> None:
+    head, board, rng = Head().small(), parse_board(BOARD), np.random.default_rng(3)
+    Path("camera").mkdir()
+    for k in range(12):
+        cv2.imwrite(f"camera/{k:02d}.png", picture_of(head, board, random_pose(head, board, rng), rng, samples=2))
+    # A sheet that is not flat.
+    u, v = np.meshgrid(np.arange(640, dtype=np.float32), np.arange(480, dtype=np.float32))
+    picture = picture_of(head, board, random_pose(head, board, rng, near=0.4, far=0.6), rng, samples=2)
+    cv2.imwrite("camera/bent.png", cv2.remap(picture, u + 3 * np.sin(v / 40), v, cv2.INTER_LINEAR))
+    code, out, err = run("calibrate", "camera", "camera", "--board", BOARD)
+    assert code == 0, err
+    assert "left out: bent.png: contradicts the others" in out
+    code, out, err = run("calibrate", "laser", "camera", "--board", "chessboard:8x6:40mm")
+    assert code == 1
+    assert "made with chessboard:8x6:30mm, this is chessboard:8x6:40mm" in out
+    assert "the laser line is visible on none of" in err and one_line(err)
+
+
+@pytest.mark.slow
 def test_three_commands_make_a_calibrated_head(run: Run) -> None:
     head = Head().small()
     truth, board = head.truth(), parse_board(BOARD)

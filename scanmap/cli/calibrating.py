@@ -237,10 +237,15 @@ def _run(
     refuse_folder("--figures", figures)
     refuse_file("--rrd", rrd, ".rrd")
     with ExitStack() as opened:
-        solved = solve(_job(part, what, base, view, opened), say)
-    unsaid = solved.views.rejected[SHOWN_REJECTED:]
-    if unsaid:
-        say(f"not used: {len(unsaid)} more pictures")
+        job = _job(part, what, base, view, opened)
+        for line in board_report.board_words(job.board, base):
+            say(line)
+        solved = solve(job, say)
+    unsaid = len(solved.views.rejected) - len(solved.fit.rejected) - SHOWN_REJECTED
+    if unsaid > 0 and not job.is_live:
+        say(f"not used: {unsaid} more pictures")
+    for left_out in solved.fit.rejected:
+        say(f"left out: {left_out.name}: {left_out.reason}")
     lost = parts_lost(solved.calibration, out)
     kept = session.write_calibration(solved.calibration, out, f"{part}_rms_px")
     say_written(out, kept)

@@ -10,6 +10,7 @@ from scanmap.calibration import Calibration, uncertainty_of
 from scanmap.session.calibrating import Solved
 from scanmap.solvers import board_figures, laser_plane
 from scanmap.solvers.axis import SOLVED, AxisFit
+from scanmap.solvers.board import Board
 from scanmap.solvers.board_pose import board_pose
 from scanmap.view.boards import write_boards
 
@@ -32,6 +33,17 @@ def laser_words(solved: Solved, base: Calibration) -> list[str]:
             f"square of {solved.views.board.name} measured on the print?"
         )
     return words
+
+
+def board_words(board: Board, base: Calibration | None) -> list[str]:
+    """A warning where the same board had other lengths in the calibration before."""
+    before = str(base.meta.get("board", "")) if base is not None else ""
+    if before in ("", board.name) or before.split(":")[:2] != board.name.split(":")[:2]:
+        return []
+    return [
+        f"warning: the calibration before was made with {before}, this is {board.name}; pictures cannot tell a length: "
+        "if it is the same board, one of them is wrong"
+    ]
 
 
 def sure_words(made: Calibration) -> str:

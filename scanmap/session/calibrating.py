@@ -113,8 +113,6 @@ def check_laser(job: BoardJob, base: Calibration, margin_m: float | None) -> tup
     """
     check_residuals(base)
     lines, _, _ = _lines(job, base, margin_m)
-    if not lines:
-        raise CalibrationError("the laser line is visible on none of the boards, so the plane cannot be checked")
     rms_m, rms_px = laser_plane.residual_of(laser_plane.plane_in_camera(base), lines, job.board, base.intrinsics)
     limit = GATES["laser_rms_px"].limit_at(base.intrinsics.width)
     if not rms_px <= limit:
@@ -236,9 +234,17 @@ def _lines(job: BoardJob, base: Calibration, margin_m: float | None) -> tuple[li
     pictures = pictures_of_source(job.source, job.config, base, laser=True)
     live = job.is_live
     views = collect(pictures, job.board, use=use, distinct=live, held=live, report=report)
-    if not lines and not any("laser" in each.reason for each in views.rejected):
+    if lines:
+        return lines, views, kept
+    unlit = sum("laser" in each.reason for each in views.rejected)
+    if not unlit:
         views.require()
-    return lines, views, kept
+    raise CalibrationError(
+        f"the laser line is visible on none of {unlit} boards: is the laser on, does it cross the squares, is the room "
+        "dim enough?"
+        if unlit
+        else f"no board counts: {views.rejected[0].reason}"
+    )
 
 
 def _meta(job: BoardJob, base: Calibration | None = None, **counts: int) -> dict[str, Any]:

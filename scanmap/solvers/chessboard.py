@@ -53,24 +53,20 @@ class Grid(NamedTuple):
         return self if across >= down else Grid(np.ascontiguousarray(self.corners.transpose(1, 0, 2)))
 
 
-def find_whole(grey: Image, across: int, down: int) -> Grid | None:
+def find_whole(grey: Image, across: int, down: int, *, thorough: bool = False) -> Grid | None:
     """A chessboard of `across` x `down` corners, all of them in sight; None if there is none.
 
-    A quick look at once, then a thorough one at a smaller picture: on clutter it costs a hundred times as much.
+    A thorough look, at a smaller picture, costs a hundred times as much on clutter.
     Source: Duda and Frese, "Accurate detection and localization of checkerboard corners for calibration", BMVC 2018.
     """
-    looks = (
-        (LOOKED_AT_PX, cv2.CALIB_CB_NORMALIZE_IMAGE),
-        (THOROUGHLY_PX, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
-    )
-    for size, flags in looks:
-        grid = _looked_for(grey, (across, down), flags | cv2.CALIB_CB_LARGER, size)
-        if grid is None or set(grid.shape) != {across, down}:
-            continue
-        # The outline of a smaller board before a dark table can pass for one more row.
-        if trimmed(grey, grid).shape == grid.shape:
-            return grid if grid.shape == (across, down) else Grid(grid.corners.transpose(1, 0, 2))
-    return None
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
+    grid = _looked_for(grey, (across, down), flags, THOROUGHLY_PX if thorough else LOOKED_AT_PX)
+    if grid is None or set(grid.shape) != {across, down}:
+        return None
+    # The outline of a smaller board before a dark table can pass for one more row.
+    if trimmed(grey, grid).shape != grid.shape:
+        return None
+    return grid if grid.shape == (across, down) else Grid(grid.corners.transpose(1, 0, 2))
 
 
 def find_part(grey: Image, *, thorough: bool = False) -> Grid | None:

@@ -88,19 +88,32 @@ def find_board(image: Image, board: Board, name: str = "", bearing: float = floa
 def _chessboard(grey: Image, board: Board) -> _Found | Rejected:
     """A whole chessboard, or a part of it; where in the board that part lies nobody can tell."""
     across, down = board.corners
-    whole = find_whole(grey, across, down)
-    grid = whole or find_part(grey)
+    grid = find_whole(grey, across, down)
+    if grid is None:
+        piece = find_part(grey)
+        if piece is not None and _has_markers(grey, piece):
+            return Rejected("", "a ChArUco board is in sight")
+        size = piece.wide().shape if piece is not None else (0, 0)
+        if size[0] > max(across, down) or size[1] > min(across, down):
+            return Rejected("", f"a chessboard of {size[0]}x{size[1]} inner corners is in sight", size)
+        grid = find_whole(grey, across, down, thorough=True) or piece
     if grid is None:
         return Rejected("", "no board found")
     both = (grid, Grid(np.ascontiguousarray(grid.corners.transpose(1, 0, 2))))
     fitting = [each for each in both if each.shape[0] <= across and each.shape[1] <= down]
-    if not fitting:
-        other = grid.wide().shape
-        return Rejected("", f"a chessboard of {other[0]}x{other[1]} inner corners is in sight", other)
     grid = _right_handed(fitting[0])
     rows, columns = np.nonzero(grid.seen)
     part = grid.shape if grid.shape != (across, down) else None
     return rows * across + columns, grid.corners[rows, columns], np.nan, part
+
+
+def _has_markers(grey: Image, grid: Grid) -> bool:
+    """Whether markers of a ChArUco board lie between the corners."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    quads = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters()).detectMarkers(grey)[0]
+    hull = cv2.convexHull(grid.corners[grid.seen].astype(np.float32))
+    middles = [np.asarray(quad, np.float64).reshape(4, 2).mean(axis=0) for quad in quads]
+    return sum(cv2.pointPolygonTest(hull, (float(u), float(v)), False) > 0 for u, v in middles) >= 2
 
 
 def _right_handed(grid: Grid) -> Grid:

@@ -28,6 +28,8 @@ VIDEO_PICTURES = 120
 PIXELS_MOST = 100_000_000  # looking for a board in more takes minutes
 # [share] by which markers may measure larger or smaller against their squares than they should.
 RATIO_MOST = 0.08
+# With fewer views than this share of the rejected ones, what the others show is the board.
+OTHER_SHARE = 0.25
 # [share of the width] a board in somebody's hands may move between two pictures and count as held still.
 REST_SHARE = 0.002
 
@@ -56,6 +58,11 @@ class Views:
 
     def require(self) -> None:
         """Raise CalibrationError where no picture shows the board at all; says what they show."""
+        if self.instead and self.views and len(self.views) < OTHER_SHARE * len(self.rejected):
+            raise CalibrationError(
+                f"{self.board.name} is in {len(self.views)} of {len(self.views) + len(self.rejected)} pictures only: "
+                f"{self.instead}"
+            )
         fault = wrong_size(self.board, self.views, self.rejected)
         if fault:
             raise CalibrationError(fault)
@@ -167,7 +174,7 @@ def _judged(
     found = find_board(seen, views.board, picture.name, picture.bearing)
     if isinstance(found, Rejected):
         views.before = None
-        if not views.views and not views.instead and len(views.rejected) < 5:
+        if not views.instead and len(views.rejected) < 5:
             views.instead = seen_instead(seen, views.board)
         return found
     moved_px = apart(found, views.before) if held else 0.0

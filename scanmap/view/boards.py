@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
 from scanmap.errors import ConfigError
-from scanmap.geometry import transform
+from scanmap.geometry import inverse, transform
 from scanmap.shot import Image
 from scanmap.view import entities as at
 from scanmap.view.pictures import jpeg
@@ -73,6 +73,15 @@ def write_boards(
     recording.log(
         "head/boards", rr.LineStrips3D(quads, colors=[120, 160, 120], radii=rr.Radius.ui_points(1.0)), static=True
     )
+    if "axis" not in calibration.meta.get("uncalibrated", ()):
+        reach = 1.2 * max(float(np.abs(np.concatenate(quads)[:, 2]).max()), 0.1)
+        ends = np.array([[0.0, 0.0, -reach], [0.0, 0.0, reach]])
+        strip = transform(inverse(calibration.mount.T_axis_head()), ends)
+        recording.log(
+            "head/axis",
+            rr.LineStrips3D([strip], colors=[230, 159, 0], radii=rr.Radius.ui_points(2.0), labels="axis"),
+            static=True,
+        )
     if points:
         cloud = transform(T, np.concatenate(list(points)))
         recording.log(
