@@ -60,6 +60,8 @@ def design(
     short = {"baseline_m": None if baseline_mm is None else baseline_mm / 1e3, "beta_deg": beta_deg,
              "alpha_deg": alpha_deg}  # fmt: skip
     heads = [_head(name, set_, calibration, short, size) for name in config or ["twin-room"]]
+    if not config and heads[0][0].endswith("*"):
+        heads = [("as given", *heads[0][1:])]
     designs = [evaluate(name, head, own.triangulation, sigma_px) for name, head, own in heads]
     if len(designs) > 1:  # one column of ranges for all
         designs = [evaluate(name, head, own.triangulation, sigma_px, np.array(RANGES_M)) for name, head, own in heads]
