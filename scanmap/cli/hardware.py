@@ -101,7 +101,7 @@ def jog(
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Turn the head by some degrees, or to a bearing.
+    """Turn the head by some degrees, or to a bearing; Ctrl-C stops it where it is.
 
     Examples: scanmap stage jog 10 --config my-rig.toml
 
