@@ -46,6 +46,7 @@ bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/grid.py
 	$(BIN)/python benchmarks/recording.py
 	$(BIN)/python benchmarks/twin.py
+	$(BIN)/python benchmarks/hard_sweep.py
 
 lock:
 	uv lock

@@ -1,7 +1,7 @@
 """A second look at the pictures in which something else was taken for the laser line, once the sweep is known.
 
 Two things are known after a sweep that no picture knows of itself: what stands still (`still`), and how bright surfaces
-are in the laser's light. Light and width of a line, times the square of its range, are what the surface reflects: 200
+are in the laser's light. Light and width of a line, times the square of its range, are what the surface reflects: 400
 times less than the usual surface of this scan is less than black paint seen at a grazing angle.
 """
 
@@ -29,7 +29,7 @@ _LEAST_ROWS = 8  # of a picture that are worth another look
 _NEAR, _MOSTLY, _AGREE = 5, 0.6, 4
 # A point this close to the axis may be any of nearly all columns of the picture, and seldom is there such a thing.
 _CLOSE_M, _AGREE_CLOSE = 0.5, 2
-_DIM, _UNCLIPPED = 0.005, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
+_DIM, _UNCLIPPED = 0.0025, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
 _ALIKE_PX = 4.0  # how far the line may run from the row that was asked, of ROWS
 _AROUND_PX = 8  # beside a line that is none, nothing is looked for
 
