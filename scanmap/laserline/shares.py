@@ -72,7 +72,12 @@ def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = Fals
     left, right = rises[0].argmax(axis=0), rises[1].argmax(axis=0) + half
     hidden = np.minimum(rises[0].max(axis=0), rises[1].max(axis=0)) < _FLANK
     # A column of the sensor that is always white has none: every beam does.
-    fault = hidden & (own[half] - np.max(own[[0, 1, -2, -1]], axis=0) > 2 * _FLANK)
+    bare = [
+        np.where(clear[near], own[near] - own[side], 0.0).max(axis=0) < 0.5 * _FLANK
+        for near, side in ((slice(half - 3, half), half - 4), (slice(half + 1, half + 4), half + 4))
+    ]
+    dark = np.maximum(own[half - 4], own[half + 4]) < COLOURLESS - 3 * _FLANK
+    fault = bare[0] & bare[1] & dark & (own[half - 1 : half + 2].max(axis=0) >= COLOURLESS)
     light = y[left, :, index] + y[right, :, index]
     near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
     # All of a side, for colour is smeared.
