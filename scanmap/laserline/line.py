@@ -16,6 +16,7 @@ from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
+from scanmap.laserline.edges import Edges, across_edges, doubt_of_edges, no_edges, sides_of
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import Grey, to_grey
 from scanmap.laserline.offframe import standing_out
@@ -142,7 +143,7 @@ def look(
 def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:
     noise = sight.noise
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
-    line = _located(sight, (row, column), params)
+    line, edges = _located(sight, (row, column), params)
     _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
     line = _within(line, window)
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
@@ -167,7 +168,9 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array)
         line = without(line, runs.crumbs(line.column_px, disturbed, _BLOCKS_ROWS), Reason.AMBIGUOUS)
         weak |= disturbed
     line = without(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
-    return _pooled(line, params.pool_rows)
+    line.column_px[:] += edges.shift
+    line = _pooled(line, params.pool_rows)
+    return line._replace(sigma_px=np.hypot(line.sigma_px, edges.doubt))
 
 
 def _pooled(line: LaserLine, rows: int) -> LaserLine:
@@ -188,22 +191,31 @@ def _pooled(line: LaserLine, rows: int) -> LaserLine:
     return line._replace(column_px=pooled, sigma_px=sigma)
 
 
-def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> LaserLine:
-    """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows."""
+def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> tuple[LaserLine, Edges]:
+    """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows.
+
+    And what edges of the room's brightness do to its columns (H,), which is no matter of whether they are the line's.
+    """
     line, noise = no_line(len(sight.lit), Reason.WEAK), sight.noise
+    edges = no_edges(len(sight.lit))
     row, column = at
     if not row.size:
-        return line
+        return line, edges
     around = samples_of(sight, row, column)
     # Speckle is one for the frame; the largest group, which comes first, tells it best.
     contrast = {"auto": None, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
     for half, some in by_width(around.lit):
         r, c = row[some], column[some]
         y, usable = around.of(half, some)
+        sides = sides_of(y, noise)
         peaks = fit_gaussian(y, usable, noise, contrast, partial(around.of, some=some))
         contrast = peaks.contrast
         reason = _judged(peaks, noise, params)
         peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some, noise)
+        if sight.off is None:
+            own = across_edges(peaks, reason == Reason.OK, sides, around, half, some, noise)
+        else:
+            own = doubt_of_edges(peaks, reason == Reason.OK, sight, (r, c), usable)
         offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         dim = (reason == Reason.WEAK) & (peaks.height >= params.min_peak) & (peaks.sigma_px < _DIM_PX)
         if dim.any():
@@ -224,9 +236,10 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         line.width_px[at_good] = peaks.width_px[k]
         line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px[k], peaks.bias_px[k]), _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
+        edges.shift[at_good], edges.doubt[at_good] = own.shift[k], own.doubt[k]
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]
-    return line
+    return line, edges
 
 
 def _take_cores(

@@ -1,0 +1,241 @@
+"""Lines across an edge of the room's own brightness: where they would be, were both sides alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.path import strips
+from scanmap.laserline.peaks import Peaks, fit_gaussian
+from scanmap.laserline.samples import Samples, ends
+from scanmap.laserline.sight import Sight
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+Index = NDArray[np.intp]
+
+_UNEVEN = 2.5  # [noise] that a laser-off picture, smoothed, must differ by under a line
+_ROWS = 7  # over which the two sides of a line are compared
+_SURE = 4.5  # [sigma] of their difference, from which on it is there
+_APART = 16  # rows in which a JPEG's blocks do the same
+_RINGING = 0.05  # of a line's height, that compression leaves beside it
+# An edge as high as the line's background, half on either side of it, moves a line by 1.7 widths (rms over places).
+_MOVES, _WORTH = 1.7, 1.5
+_PLACES_PX = np.arange(-6.0, 6.1, 1.0, dtype=np.float32)  # of the edge, from the middle of the window
+_STEPS, _LONG = 4, 0.15  # at most, and [widths] what is long
+_REST = 0.15  # of what an edge may do to a line, is left where its explanations agree
+_FARTHEST = 1.0  # [widths] that an edge is believed to move a line by
+_BLUR_PX = 0.8  # of an edge, by optics and pixels
+_RATIO = 4.0  # of the two sides, at most
+_LEAST = 1.0  # [grey levels] of a side
+
+
+class Sides(NamedTuple):
+    """Levels beside N lines, of some rows each, arrays (N,) [grey levels]."""
+
+    left: F32
+    right: F32
+    differ: NDArray[np.bool_]  # by more than noise explains
+
+
+class Edges(NamedTuple):
+    """What edges of the room's own brightness do to N lines, arrays (N,) [px]."""
+
+    shift: F32  # that takes it back
+    doubt: F32  # standard deviation of what is left; of all rows of an upright line alike
+
+
+def no_edges(rows: int) -> Edges:
+    """Nothing of `rows` lines."""
+    return Edges(np.zeros(rows, np.float32), np.zeros(rows, np.float32))
+
+
+def sides_of(y: F32, noise: float) -> Sides:
+    """Levels at the two ends of windows (n, N)."""
+    k = max(2, len(y) // 6)
+    left, right = (cv2.blur(v[None], (_ROWS, 1), borderType=cv2.BORDER_REPLICATE)[0] for v in ends(y))
+    step = right - left
+    # Compression leaves noise that means do not take out: what they still scatter by, some rows apart.
+    scatter = float(np.median(np.abs(step[_APART:] - step[:-_APART]))) / 0.954 if len(step) > 2 * _APART else 0.0
+    return Sides(left, right, np.abs(step) > _SURE * max(noise * np.sqrt(2.0 / (k * _ROWS)), scatter))
+
+
+def across_edges(
+    peaks: Peaks, good: NDArray[np.bool_], sides: Sides, around: Samples, half: int, some: Index | slice, noise: float
+) -> Edges:
+    """What steps of the room's brightness under the lines do to them.
+
+    An edge of paint is in the line's light as in the room's: both are multiplied by the same step. A shadow's edge is
+    in the room's only. How high the step is is seen beside the line; where it is, and of which kind, is what explains
+    the row best.
+    """
+    edges = no_edges(len(good))
+    contrast = np.abs(sides.right - sides.left) / np.maximum(sides.right + sides.left, np.float32(2.0 * _LEAST))
+    moved = np.float32(_MOVES) * contrast * peaks.width_px
+    differ = sides.differ & (np.abs(sides.right - sides.left) > _RINGING * peaks.height)
+    at = np.flatnonzero(
+        good & differ & (moved > _WORTH * peaks.sigma_px) & ~peaks.clipped & (np.abs(peaks.offset_px) < 2.0)
+    )
+    if not at.size:
+        return edges
+    y, usable = around.of(half, at if isinstance(some, slice) else some[at])
+    whole = usable.all(axis=0)
+    y, at = np.ascontiguousarray(y[:, whole]), at[whole]
+    left, right = (np.maximum(side[at], np.float32(_LEAST)) for side in (sides.left, sides.right))
+    right = np.minimum(np.maximum(right, left / np.float32(_RATIO)), left * np.float32(_RATIO))
+    shift, spread = _explained(_evened(y, left, right), peaks.offset_px[at], peaks.width_px[at], noise)
+    # Where explanations are far from each other, what is known beforehand counts as well.
+    share = np.square(moved[at]) / (np.square(moved[at]) + np.square(spread))
+    edges.shift[at] = share * shift
+    edges.doubt[at] = np.hypot(np.sqrt(share) * spread, np.float32(_REST) * moved[at])
+    return edges
+
+
+def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tuple[Index, Index], usable: F32) -> Edges:
+    """How much is open of the places of lines (N,) that lie on what the laser-off picture shows uneven.
+
+    Args:
+        at: rows and columns (N,) of the middles of the windows.
+        usable: (n, N) 1, or 0 for samples that say little.
+
+    Paint dims both lights alike: what the laser added, over what was there without it, is the same on dark paint and on
+    light. Where only the room's light differs (a shadow, a lamp), what a camera codes of the same laser is less on the
+    bright side; its light is the same. Which it is, and by what curve light is coded, is not known: how far the line's
+    places by all of these are from each other counts as doubt.
+    """
+    edges = no_edges(len(good))
+    assert sight.off is not None
+    half = len(usable) // 2
+    rows, columns = (values[good] for values in at)
+    if not rows.size:
+        return edges
+    room = sum(_strips(sight.off, np.clip(rows + k, 0, len(sight.off) - 1), columns, half) for k in (-1, 0, 1))
+    smooth = np.array([[1.0], [2.0], [1.0]], np.float32) / np.float32(12.0)
+    room = np.asarray(cv2.filter2D(np.asarray(room), -1, smooth, borderType=cv2.BORDER_REPLICATE), np.float32)
+    low, high = room.min(axis=0), room.max(axis=0)
+    contrast = (high - low) / np.maximum(high + low, np.float32(2.0 * _LEAST))
+    uneven = high - low > np.float32(_UNEVEN * sight.noise)
+    uneven &= _MOVES * contrast * peaks.width_px[good] > _WORTH * peaks.sigma_px[good]
+    some = np.flatnonzero(uneven)
+    if not some.size:
+        return edges
+    lit, dark = _strips(sight.on, rows[some], columns[some], half), room[:, some]
+    even = _added(lit, dark)
+    which = np.flatnonzero(good)[some]
+    tells = usable[:, which] * (np.maximum(lit, dark) < SATURATED - 3)
+    many = np.ascontiguousarray(np.broadcast_to(tells[:, None], even.shape)).reshape(len(even), -1)
+    found = fit_gaussian(even.reshape(len(even), -1), many, sight.noise, peaks.contrast)
+    u = found.offset_px.reshape(even.shape[1:]) - peaks.offset_px[which]
+    edges.doubt[which] = np.minimum(np.maximum(u, -_MOVES), _MOVES).std(axis=0)
+    return edges
+
+
+def _added(lit: F32, dark: F32) -> F32:
+    """What a laser added to windows (n, M): as coded or as light, as it is or over what was there: (n, 4, M)."""
+    high = dark.max(axis=0)
+    paint = np.maximum(dark, np.maximum(high / np.float32(_RATIO), np.float32(_LEAST)))
+    light, before = _light(lit), _light(dark)
+    usual = (_light(lit + np.float32(1.0)) - light).mean(axis=0)
+    albedo = np.maximum(before, before.max(axis=0) / np.float32(_RATIO * _RATIO))
+    coded, true = lit - dark, (light - before) / usual
+    kinds = [coded, coded * (paint.mean(axis=0) / paint), true, true * (albedo.mean(axis=0) / albedo)]
+    return np.ascontiguousarray(np.stack(kinds, axis=1), np.float32)
+
+
+def _strips(plane: U8, row: Index, column: Index, half: int) -> F32:
+    """Samples (2 half + 1, N) around integer columns (N,) of rows (N,)."""
+    return strips(plane, row, column, half).astype(np.float32)
+
+
+def _light(coded: F32) -> F32:
+    """Light [of saturation] behind grey levels, by the curve that cameras code it with (IEC 61966-2-1)."""
+    v = np.maximum(coded, 0.0) * np.float32(1.0 / 255.0)
+    light: F32 = np.where(v <= 0.04045, v * (1.0 / 12.92), ((v + 0.055) * (1.0 / 1.055)) ** 2.4).astype(np.float32)
+    return light
+
+
+def _evened(y: F32, left: F32, right: F32) -> F32:
+    """Windows (n, M) as they would be without edges of known height at several places (n, K, M)."""
+    x = (np.arange(len(y), dtype=np.float32) - len(y) // 2)[:, None]
+    middle = np.float32(0.5) * (left + right)
+    # An edge, or an even ramp from one end to the other.
+    step = np.concatenate([_step(x, _PLACES_PX), 0.5 + x / np.float32(len(y) - 2)], axis=1)[:, :, None]
+    level = (left + (right - left) * step).astype(np.float32)
+    paint, shadow = level / middle, level - middle
+    return np.concatenate([y[:, None] / paint, y[:, None] - shadow, y[:, None]], axis=1)
+
+
+def _explained(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32]:
+    """How far lines (M,) lie from `u`, by several explanations of their windows, and how far those are from each other.
+
+    Args:
+        even: (n, K, M) the windows without what each explanation says is not the line.
+        u: (M,) where the lines are without any [px from the middle].
+        width: (M,) how wide they are, as sigma [px].
+        noise: standard deviation of a sample [grey levels].
+
+    Steps of Gauss and Newton from a common place, weighted by their likelihoods; where they are long, again from there.
+    """
+    start, limit = u, np.float32(_FARTHEST) * width
+    shift, spread = np.zeros_like(u), np.zeros_like(u)
+    far = np.arange(len(u))
+    for _ in range(_STEPS):
+        step, spread[far], wider = _step_from(even[:, :, far], start[far] + shift[far], width[far], noise)
+        shift[far] = np.minimum(np.maximum(shift[far] + step, -limit[far]), limit[far])
+        long = np.abs(step) > _LONG * width[far]
+        width = width.copy()
+        width[far] = np.maximum(width[far] * wider, np.float32(0.5))
+        far = far[long]
+        if not far.size:
+            break
+    return shift, spread
+
+
+def _step_from(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32, F32]:
+    """One step (M,) from `u`, the spread of the explanations' places, and the factor by which lines are wider."""
+    n = len(even)
+    z = ((np.arange(n, dtype=np.float32) - n // 2)[:, None] - u) / width
+    bell = np.exp(np.float32(-0.5) * np.square(z))
+    profiles = [np.ones_like(bell), bell, bell * np.square(z), bell * z]
+    parts = _orthogonal(profiles)
+    level, high, wide, moved = (np.einsum("nm,nkm->km", part, even) for part in parts)
+    chi2 = np.einsum("nkm,nkm->km", even, even) - level**2 - high**2 - wide**2 - moved**2
+    chi2 *= np.float32(1.0 / noise**2)
+    # Lengths of what each profile has of its own turn shares into height, width and place.
+    _, per_height, per_width, per_shift = (
+        np.einsum("nm,nm->m", part, profile) for part, profile in zip(parts, profiles, strict=True)
+    )
+    wider = wide / per_width
+    height = high / per_height - wider * np.einsum("nm,nm->m", parts[1], profiles[2]) / per_height
+    height = np.maximum(height, np.float32(0.2) * high / per_height + np.float32(0.1))
+    shift = np.minimum(np.maximum(moved / per_shift / height, np.float32(-0.5)), np.float32(0.5)) * width
+    wider = np.minimum(np.maximum(np.float32(1.0) + wider / height, np.float32(0.7)), np.float32(1.4))
+    # What no explanation covers is not noise: it makes all of them more alike.
+    least = chi2.min(axis=0)
+    scatter = np.maximum(least / np.float32(max(n - 6, 1)), np.float32(1.0))
+    share = np.exp(np.float32(-0.5) * (chi2 - least) / scatter)
+    share /= share.sum(axis=0)
+    place = (share * shift).sum(axis=0)
+    return place, np.sqrt((share * np.square(shift - place)).sum(axis=0)), (share * wider).sum(axis=0)
+
+
+def _orthogonal(parts: list[F32]) -> list[F32]:
+    """Each of the profiles (n, M) without what those before it have of it, of length 1 (Gram and Schmidt)."""
+    done: list[F32] = []
+    for part in parts:
+        own = part.copy()
+        for other in done:
+            own -= other * np.einsum("nm,nm->m", other, own)
+        own *= np.float32(1.0) / np.sqrt(np.einsum("nm,nm->m", own, own))
+        done.append(own)
+    return done
+
+
+def _step(x: F32, places: F32) -> F32:
+    """A blurred step (n, K), by the logistic that is nearest to a Gaussian's integral."""
+    step: F32 = (1.0 / (1.0 + np.exp((places - x) * np.float32(1.7 / _BLUR_PX)))).astype(np.float32)
+    return step
