@@ -115,6 +115,22 @@ def test_a_head_that_is_not_this_one_is_refused() -> None:
         refine(room_lines(0.008, seed=1), off_by(head(), 4.5, (0.0, 0.0)))
 
 
+@pytest.mark.parametrize(
+    ("missing", "words"), [("laser plane", "no laser plane to refine"), ("axis", "has no axis yet: write the head's")]
+)
+def test_what_was_never_calibrated_is_named(missing: str, words: str) -> None:
+    wrong = replace(off_by(head(), 4.5, (0.0, 0.0)), meta={"uncalibrated": [missing]})
+    with pytest.raises(CalibrationError, match=words):
+        refine(room_lines(0.008, seed=1), wrong)
+
+
+def test_half_a_turn_of_a_bare_box_ends_with_an_answer() -> None:
+    """Pieces of a few patches at the ends of the walls have no plane, and must not count as one."""
+    lines = room_lines(0.008, seed=4, mount=HeadMount(), bearings=np.arange(0.0, 181.0, 3.0))
+    refined = refine(lines, off_by(head(mount=HeadMount()), 0.5, (0.008, -0.006)))
+    assert abs(np.degrees(refined.after.beta) - 25.7) < 0.05
+
+
 def test_rendered_room_without_its_offset(data: Path) -> None:
     source = data / "rendered" / "room-offset"
     exact = head_of_rig_json(source / "rig.json")
@@ -160,9 +176,8 @@ def test_photographed_block_comes_right_from_the_boards_plane(
     cloud = result.scan.points[result.scan.valid].astype(np.float64)
     side = cloud[(cloud[:, 2] > 0.006) & (cloud[:, 2] < 0.034) & (np.hypot(*cloud[:, :2].T) < 0.07)]
     faces, sizes = block_faces(side)
-    # The aim is 55 x 92 mm within 1 mm. The long side comes out at 93.0 to 93.2 mm: the glow of the wax is in it.
     assert min(sizes) == pytest.approx(0.055, abs=0.001)
-    assert max(sizes) == pytest.approx(0.092, abs=0.0013)
+    assert max(sizes) == pytest.approx(0.092, abs=0.001)
     for face in faces:
         assert fit_plane(without_strays(face)).rms_m < 0.0005
     code, said, _ = run(capsys, "check", source, "--config", "srv-turntable", "--calibration", str(out))
@@ -178,12 +193,13 @@ def without_strays(face: np.ndarray) -> np.ndarray:
 def test_the_command_writes_beside_the_old_one_and_says_what_it_saw(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, picture = tmp_path / "calibration.toml", tmp_path / "walls.png"
+    out, picture, space = tmp_path / "calibration.toml", tmp_path / "walls.png", tmp_path / "walls.rrd"
     recording, wrong = twin_recording(tmp_path)
-    wrong.save(out)
+    replace(wrong, meta={"uncalibrated": ["axis"]}).save(out)
     code, said, complaint = run(
-        capsys, "self", str(recording), "--calibration", str(out), "--out", str(out), "--figure", str(picture)
-    )
+        capsys, "self", str(recording), "--calibration", str(out), "--out", str(out), "--figure", str(picture),
+        "--rrd", str(space),
+    )  # fmt: skip
     assert code == 0, complaint
     assert "DIGITAL TWIN" in said and "not observable" in said and "calibration.toml.1" in said
     assert Calibration.load(tmp_path / "calibration.toml.1").beta == pytest.approx(wrong.beta)
@@ -194,7 +210,8 @@ def test_the_command_writes_beside_the_old_one_and_says_what_it_saw(
     assert known is not None
     for name, true, found in zip(("offset_x", "offset_y"), (0.0, 0.0), after.mount.offset_m, strict=False):
         assert abs(found - true) < 4 * known.sigma(name)
-    assert picture.stat().st_size > 20_000
+    assert "uncalibrated" not in after.meta and "square to each other" in said
+    assert picture.stat().st_size > 20_000 and space.stat().st_size > 20_000
     # A good head is left as it is, and what cannot be read costs nothing either.
     before = out.read_bytes()
     for words, complaint in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,6 +20,7 @@ Recording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), a folder with scan.csv, or a video.")
 ]
 Figure = Annotated[Path | None, typer.Option("--figure", metavar="F.png", help="Draw the walls as PNG.")]
+Rrd = Annotated[Path | None, typer.Option("--rrd", metavar="F.rrd", help="The walls in space, for scanmap view F.rrd.")]
 
 
 def self_(
@@ -34,6 +36,7 @@ def self_(
         Path, typer.Option("--out", metavar="F.toml", help="The new calibration; an old one is kept beside.")
     ] = Path("calibration.toml"),
     figure: Figure = None,
+    rrd: Rrd = None,
 ) -> None:
     """Refine a head without a board, by a scan of an ordinary room.
 
@@ -43,21 +46,31 @@ def self_(
 
     Example: scanmap calibrate self room.mcap --out calibration.toml
     """
-    from scanmap.calibration.keeping import refuse_path
+    from scanmap.calibration.keeping import refuse_file, refuse_path
+    from scanmap.cli.report import rounds_bar
     from scanmap.cli.terminal import say
     from scanmap.session.judging import write_refined
     from scanmap.solvers.self_calibration import refine
 
     refuse_path(out)
     _check_figure(figure)
+    refuse_file("--rrd", rrd, ".rrd")
     measured, is_twin = _measure(recording, config, set_, calibration)
-    refined = refine(measured.lines, measured.calibration, None if scale == "auto" else scale)
+    with rounds_bar("making walls flat") as progress:
+        refined = refine(measured.lines, measured.calibration, None if scale == "auto" else scale, progress=progress)
     _print_refined(refined)
     if figure is not None:
         from scanmap.solvers.wall_figures import draw_refined
 
         draw_refined(refined.before, refined.after, refined.segments, refined.patches, figure)
         say(f"wrote {figure}")
+    if rrd is not None:
+        from scanmap.solvers.wall_figures import in_space
+        from scanmap.view.walls import write_walls
+
+        heads = (("before", refined.before), ("after", refined.after))
+        write_walls(rrd, [in_space(name, head, refined.segments, refined.patches) for name, head in heads])
+        say(f"wrote {rrd}")
     kept = write_refined(refined, out, recording, is_twin=is_twin)
     say(f"wrote {out}" + (f"; the one that was there is {kept}" if kept else ""))
     files = f"{shlex.quote(str(recording))}{_again(config, set_)} --calibration {shlex.quote(str(out))}"
@@ -77,6 +90,7 @@ def check(
         float, typer.Option("--wall-mm-per-m", min=0.0, max=20.0, help="How flat the walls themselves are.")
     ] = 0.5,
     figure: Figure = None,
+    rrd: Rrd = None,
 ) -> None:
     """Judge a calibration by a scan of a room: flatness, bow, corners, repeatability.
 
@@ -84,21 +98,33 @@ def check(
 
     Example: scanmap calibrate check room.mcap --figure walls.png
     """
+    from scanmap.calibration.keeping import refuse_file
+    from scanmap.cli.report import rounds_bar
     from scanmap.cli.terminal import say
     from scanmap.solvers.check import check as judge
     from scanmap.solvers.walls import CheckParams
 
     _check_figure(figure)
+    refuse_file("--rrd", rrd, ".rrd")
     measured, _ = _measure(recording, config, set_, calibration)
-    judged = judge(
-        measured.lines, measured.calibration, CheckParams(square=not not_square, wall_mm_per_m=wall_mm_per_m)
-    )
+    params = CheckParams(square=not not_square, wall_mm_per_m=wall_mm_per_m)
+    with rounds_bar("judging walls") as progress:
+        judged = judge(measured.lines, measured.calibration, params, progress=progress)
     _print_check(judged)
     if figure is not None:
         from scanmap.solvers.wall_figures import draw_check
 
         draw_check(judged, measured.calibration, figure, f"{recording.name}: {'pass' if judged.passed else 'FAIL'}")
         say(f"wrote {figure}")
+    if rrd is not None:
+        from scanmap.solvers.wall_figures import in_space
+        from scanmap.view.walls import write_walls
+
+        heads = [("calibrated", measured.calibration)]
+        if judged.refined is not None:
+            heads.append(("best for this scan", judged.refined.after))
+        write_walls(rrd, [in_space(name, head, judged.segments, judged.patches) for name, head in heads])
+        say(f"wrote {rrd}")
     if not judged.passed:
         say(
             f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}"
@@ -165,6 +191,11 @@ def _print_refined(refined: Refined) -> None:
         )  # fmt: skip
     console.print(walls)
     say(f"all flat pieces: {refined.rms_before_px:.3f} px rms before, {refined.rms_after_px:.3f} px after")
+    if refined.square.walls:
+        say(
+            f"{refined.square.walls} upright pieces are square to each other to about "
+            f"{degrees(refined.square.scatter):.2f} deg; what that says of the head is used"
+        )
     say(f"not observable by any such scan: {'; '.join(UNOBSERVABLE)}")
 
 

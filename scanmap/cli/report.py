@@ -47,6 +47,22 @@ def progress_bar(work: str, total: int | None) -> Iterator[Callable[[Progress], 
         yield move
 
 
+@contextmanager
+def rounds_bar(work: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar for work of a few rounds; gives the function that is told (done, all). Where nobody watches, one line."""
+    if not console.is_terminal:
+        say(f"{work} ...")
+        yield lambda done, total: None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn())
+    with Bar(*columns, console=console, expand=True, redirect_stdout=False) as bar:
+        task = bar.add_task(work, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
 def _lines(work: str) -> Callable[[Progress], None]:
     begun = last = time.monotonic()
 

@@ -77,9 +77,13 @@ def write_refined(refined: Refined, out: Path, recording: Path, *, is_twin: bool
         raise CalibrationError("nothing is written: the calibration is no better than the one before")
     stale = {"laser_rms_px", *(("axis_rms_px",) if refined.scale == "baseline" else ())}
     residuals = {key: value for key, value in refined.after.residuals.items() if key not in stale}
+    # What was a guess at the axis before is measured now; a turntable's axis was given.
+    missing = [each for each in refined.after.meta.get("uncalibrated", ()) if each != "axis" or refined.scale == "axis"]
+    before = {key: value for key, value in refined.after.meta.items() if key != "uncalibrated"}
     meta = {
-        **refined.after.meta, "self_command": "calibrate self", "self_recording": recording.name,
-        "self_date": date.today().isoformat(), "self_pieces": len(refined.segments), "self_scale": refined.scale,
+        **before, **({"uncalibrated": missing} if missing else {}),
+        "self_command": "calibrate self", "self_recording": recording.name, "self_date": date.today().isoformat(),
+        "self_pieces": len(refined.segments), "self_scale": refined.scale,
         **({"source": "digital twin"} if is_twin else {}),
     }  # fmt: skip
     return save_beside(

@@ -7,6 +7,7 @@ there: the line's noise and shared error, the calibration's covariance, and a wa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -99,8 +100,14 @@ class Check:
         return self.flat and self.corners_hold and self.passes_agree and not self.contradictions
 
 
-def check(lines: Lines, calibration: Calibration, params: CheckParams | None = None) -> Check:
+def check(
+    lines: Lines, calibration: Calibration, params: CheckParams | None = None, *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Check:  # fmt: skip
     """Judge a calibration by one scan.
+
+    Args:
+        progress: told after every round how many of how many are done.
 
     Raises:
         CalibrationError: the scan shows too little that is flat to judge anything by.
@@ -110,7 +117,7 @@ def check(lines: Lines, calibration: Calibration, params: CheckParams | None = N
     sight = sight_of(patches, calibration.intrinsics)
     points, per_column = located(sight, calibration)
     try:
-        refined: Refined | None = refine(lines, calibration, any_gain=True)
+        refined: Refined | None = refine(lines, calibration, any_gain=True, progress=progress)
     except CalibrationError:
         refined = None
     segments = refined.segments if refined else grow(points, per_column, patches, params.tolerance_px)

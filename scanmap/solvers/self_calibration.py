@@ -28,12 +28,16 @@ Array = NDArray[np.float64]
 
 START_TOLERANCE_PX = 3.0
 ROUNDS = 6
-REWEIGHTED = 4  # times, in the last round
+REWEIGHTED = 4  # times a round; with fewer, where it ends depends on where it began
 FEWEST_PIECES = 3
 # A parameter is observed if the scan knows it at least this much better than the ruler.
 OBSERVED = 0.5
 # A head farther off than this many ruler's deviations is not refined but wrong.
 FARTHEST = 3.5
+NO_AXIS = (
+    ". This calibration has no axis yet: write the head's offset from it, by a ruler, as head_offset_m under [axis], "
+    "or run scanmap calibrate axis"
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,10 @@ def refine(
         CalibrationError: the scan cannot tell (too few bearings or flat pieces, walls that leave it open), or what it
             tells is not small: nothing is better than a wrong calibration.
     """
+    if "laser plane" in calibration.meta.get("uncalibrated", ()):
+        raise CalibrationError(
+            "this calibration has no laser plane to refine yet: scanmap calibrate laser, or write that of its drawing"
+        )
     patches = patches_of(lines)
     if len(np.unique(np.round(patches.bearings, 3))) < 8:
         raise CalibrationError(
@@ -102,7 +110,7 @@ def refine(
                 f"only {len(adjustment)} flat pieces found (3 at least): point the scanner at walls, floor and "
                 "furniture with flat faces, or calibrate with a board: scanmap calibrate laser"
             )
-        solution = adjustment.solve(change, REWEIGHTED if done == ROUNDS else 2)
+        solution = adjustment.solve(change, REWEIGHTED)
         change, tolerance = solution.change, max(0.5 * tolerance, min(5.0 * segments.noise_px, tolerance))
         if progress is not None:
             progress(done, ROUNDS)
@@ -142,12 +150,16 @@ def _judged(
         raise CalibrationError(
             f"this scan cannot tell {', '.join(blind)}: its flat pieces leave it open. Scan a corner of a room, walls "
             "on three sides, a full turn if the cable allows it; nothing is written"
+            + NO_AXIS
+            * ("axis" in outcome.calibration.meta.get("uncalibrated", ()))
         )
     far = [e.name for e, r in zip(estimates, outcome.ruler, strict=True) if abs(e.change) > FARTHEST * r]
     if far:
         raise CalibrationError(
             f"self-calibration would change {', '.join(far)} far more than a ruler errs: the head is not the one of "
             "this calibration, or the scan has hardly a flat wall. Calibrate with a board; nothing is written"
+            + NO_AXIS
+            * ("axis" in outcome.calibration.meta.get("uncalibrated", ()))
         )
     before, after = (_rms(fit[0].residual(x, fit[1])[0]) for x in (np.zeros(len(outcome.change)), outcome.change))
     if not after <= before and not any_gain:

@@ -83,10 +83,11 @@ def write_boards(
             static=True,
         )
     if points:
-        cloud = transform(T, np.concatenate(list(points)))
+        cloud, off = transform(T, np.concatenate(list(points))), np.concatenate(list(off_m))
+        colours = colours_by_distance(off, float(np.percentile(np.abs(off), 95)))
         recording.log(
             "head/laser",
-            rr.Points3D(cloud, colors=_colours(np.concatenate(list(off_m))), radii=rr.Radius.ui_points(1.5)),
+            rr.Points3D(cloud, colors=colours, radii=rr.Radius.ui_points(1.5)),
             static=True,
         )
         fan = laser_fan(calibration, 1.1 * float(np.linalg.norm(cloud, axis=1).max()))
@@ -99,9 +100,9 @@ def write_boards(
     recording.disconnect()
 
 
-def _colours(off_m: Array) -> NDArray[np.uint8]:
-    """RGB (N, 3) by distance from the plane, full colour at the 95th percentile."""
-    share = np.clip(off_m / max(float(np.percentile(np.abs(off_m), 95)), 1e-9), -1.0, 1.0)[:, None]
+def colours_by_distance(off: Array, limit: float) -> NDArray[np.uint8]:
+    """RGB (N, 3) by signed distance from a plane, full colour at `limit` in the same unit."""
+    share = np.clip(off / max(limit, 1e-9), -1.0, 1.0)[:, None]
     mixed = np.where(share < 0, _ON + (_ON - _NEAR) * share, _ON + (_FAR - _ON) * share)
     return np.asarray(np.rint(mixed), np.uint8)
 
