@@ -64,13 +64,14 @@ def missed(refined: Refined, exact: Calibration) -> np.ndarray:
 def test_a_square_room_tells_the_offset_that_flat_walls_leave_open() -> None:
     exact, flat_only, squared_too = head(300, MOUNT), [], []
     for seed in range(4):
-        refined = refine(room_seen(SQUARE, CUPBOARDS, seed, shared_px=0.004), off_by(exact, 0.5, (0.008, -0.006)))
+        lines = room_seen(SQUARE, CUPBOARDS, seed, 0.004, np.arange(0.0, 181.0, 1.5))
+        refined = refine(lines, off_by(exact, 0.5, (0.008, -0.006)))
         assert refined.square.walls >= 5 and np.degrees(refined.square.scatter) < 0.15
         squared_too.append(missed(refined, exact))
         flat_only.append(missed(refined, exact) - refined.square.change[2:4])
         sigma = [refined.estimate(name).sigma for name in ("offset_x", "offset_y")]
         assert (np.abs(squared_too[-1]) < 3 * np.array(sigma)).all()
-    assert np.sqrt(np.mean(np.square(squared_too))) < 0.5 * np.sqrt(np.mean(np.square(flat_only)))
+    assert np.sqrt(np.mean(np.square(squared_too))) < 0.8 * np.sqrt(np.mean(np.square(flat_only)))
 
 
 def test_a_room_that_is_not_square_does_no_harm() -> None:
