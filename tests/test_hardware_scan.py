@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fake_cameras import FakeCapture, FakeDevice
 from scanmap import config as configuration
 from scanmap import session
 from scanmap.errors import CalibrationError, CameraError, ConfigError, StageError
-from scanmap.recording import open_source
+from scanmap.recording import describe, open_source
 from scanmap.rig import grbl_opening
 from scanmap.session.rigs import open_rig
 from scanmap.shot import decode_image
@@ -128,6 +129,22 @@ def test_a_camera_lost_in_mid_scan_keeps_what_was_scanned(head: Head, choice: se
     assert len(result.scan.bearings) >= 2
     assert (tmp_path / "room.ply").exists()
     assert not head.board.laser_on and not head.board.motor_on
+
+
+def test_a_camera_that_comes_back_leaves_a_note_in_the_recording(
+    head: Head, choice: session.Choice, tmp_path: Path
+) -> None:
+    outputs = session.Outputs(record=tmp_path / "room.mcap")
+
+    def wobble(progress: session.Progress) -> None:
+        if progress.done == 2:
+            head.device.unplugged = True
+            threading.Timer(0.3, setattr, (head.device, "unplugged", False)).start()
+
+    with session.prepare_scan(choice, outputs, view=False) as job:
+        assert job.run(wobble, lambda: False).ended == "finished"
+    noted = [fault for fault in describe(tmp_path / "room.mcap").faults if fault.part == "camera"]
+    assert noted and "camera 0" in noted[0].message
 
 
 def test_exposures_that_nobody_can_set_are_refused_before_anything_opens(head: Head) -> None:

@@ -22,6 +22,7 @@ from scanmap.pipeline import Pipeline, Processes, Runner, SecondLook, Sink, Step
 from scanmap.recording import Recorder
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
+from scanmap.session.noting import noting
 from scanmap.session.outputs import Outputs, write_results
 from scanmap.session.refining import Refinement
 from scanmap.session.settling import read_again, settle
@@ -120,7 +121,7 @@ class Job:
             second_look = SecondLook(pipeline)
             sinks: list[Sink] = [*self._sinks(scan, progress), second_look]
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
-            with closing(self._recorded()) as shots, self.runner(pipeline) as run_shots:
+            with noting(self.note), closing(self._recorded()) as shots, self.runner(pipeline) as run_shots:
                 run_shots(checked(shots, self.calibration), sinks=sinks, stop=stop)
             if stop():
                 ended = "interrupted"
@@ -150,11 +151,11 @@ class Job:
         self._withdrawn.update(k for k, index in enumerate(self._handed_out_indices) if index in indices)
         self._take_back(indices, why)
 
-    def note(self, fault: str) -> None:
+    def note(self, fault: str, part: str = "sweep") -> None:
         """Keep a fault that was overcome, in the result and in the recording."""
         self.faults.append(fault)
         if self.recorder is not None and not self.recorder.closed:
-            self.recorder.fault(fault, part="sweep", seconds=self._last_s)
+            self.recorder.fault(fault, part=part, seconds=self._last_s)
 
     @contextmanager
     def runner(self, pipeline: Pipeline) -> Iterator[Runner]:
