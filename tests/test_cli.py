@@ -606,3 +606,20 @@ def test_bar_on_a_terminal_moves_and_ends(small: Path, tmp_path: Path) -> None:
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode())
     assert "7/7 0:00:00 left, bearing 180.00 deg" in text and "wrote a.ply" in text
     assert max(len(line) for line in re.split(r"[\r\n]+", text)) <= 80
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are bytes on POSIX only")
+def test_a_name_that_is_no_text_is_readable_in_messages_and_refused_for_outputs(run: Run, twin_scan: TwinScan) -> None:
+    name = os.fsdecode(b"r\xffoom")
+    said = run("scan", *QUICK, "--out", f"{name}.ply")
+    assert said.code == 2 and "r\\xffoom.ply: maps and recordings name files in UTF-8" in said.err
+    assert not list(Path().iterdir())
+    shutil.copy(twin_scan.recording, f"{name}.mcap")
+    said = run("info", f"{name}.mcap")
+    assert said.code == 0 and "recording r\\xffoom.mcap: " in said.out
+    assert "r\\xffoom.mcap is complete" in run("scan", "--resume", f"{name}.mcap").err
+
+
+def test_what_a_terminal_has_no_sign_for_is_written_as_an_escape() -> None:
+    assert terminal.printable("wall \u2013 \udcff \ud800", "ascii") == r"wall \u2013 \udcff \ud800"
+    assert terminal.printable("caf\u00e9 \udcff", "utf-8") == "caf\u00e9 \\xff"

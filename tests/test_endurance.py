@@ -1,9 +1,14 @@
-"""Scan after scan in fast-forward, as in a day and a night: nothing piles up."""
+"""Scan after scan in fast-forward, as in a day and a night: nothing piles up.
+
+A scan of 180 bearings takes three minutes on a head: a day and a night are 480 of them (`ENDURANCE_SCANS=480`).
+"""
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
+import sys
 import threading
 from pathlib import Path
 
@@ -18,8 +23,12 @@ QUICK = (
 
 
 def held() -> tuple[int, int, int]:
-    """Memory [kB], threads, file handles of this process."""
+    """Memory [kB], threads, file handles of this process; memory without what is free and only not given back."""
     gc.collect()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+        if trim is not None:
+            trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return (
         pages * os.sysconf("SC_PAGE_SIZE") // 1024,
@@ -42,4 +51,4 @@ def test_nothing_piles_up_from_scan_to_scan(tmp_path: Path) -> None:
             print(f"after {number + 1} scans: {seen[-1][0]} kB, {seen[-1][1]} threads, {seen[-1][2]} handles")
     settled, last = seen[len(seen) // 3], seen[-1]
     assert last[1:] == settled[1:]
-    assert last[0] < settled[0] * 1.03 + 2000
+    assert last[0] < settled[0] + 1000

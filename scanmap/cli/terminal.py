@@ -32,7 +32,7 @@ class SteadyOutput:
 
     def write(self, text: str) -> int:
         """Write, or do nothing where nobody listens."""
-        self._attempt(lambda: sys.stdout.write(text))
+        self._attempt(lambda: sys.stdout.write(printable(text, sys.stdout.encoding)))
         return len(text)
 
     def flush(self) -> None:
@@ -66,6 +66,16 @@ output = SteadyOutput()
 console = Console(file=output, highlight=False, emoji=False)  # type: ignore[arg-type]
 
 
+def printable(text: str, encoding: str | None) -> str:
+    """The text, with `\\xff` for bytes of file names that are no text, and for what the terminal has no sign for."""
+    try:
+        text = text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:
+        text = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    encoding = encoding or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 def say(text: str) -> None:
     """One line to the user, taken as it is; broken at words where a person reads it, never in a pipe."""
     console.print(text, markup=False, soft_wrap=not console.is_terminal)
@@ -74,7 +84,7 @@ def say(text: str) -> None:
 def complain(text: str) -> None:
     """One line on standard error, whatever line breaks the text has."""
     with suppress(OSError, ValueError, AttributeError):
-        print(f"scanmap: {' '.join(text.split())}", file=sys.stderr)
+        print(printable(f"scanmap: {' '.join(text.split())}", sys.stderr.encoding), file=sys.stderr)
 
 
 class _ToStderr(logging.Handler):
@@ -82,7 +92,7 @@ class _ToStderr(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError, ValueError, AttributeError):
-            print(self.format(record), file=sys.stderr)
+            print(printable(self.format(record), sys.stderr.encoding), file=sys.stderr)
 
 
 def set_up_logging(debug: bool) -> None:

@@ -23,12 +23,16 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = (*CLOUDS, *MESH
     """Find out before a scan, not after it, whether `path` can be written.
 
     Raises:
-        ConfigError: unknown ending, no such folder, or no right to write there.
+        ConfigError: unknown ending, a name that is no text, no such folder, or no right to write there.
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         ending = path.suffix or "no ending"
         raise ConfigError(f"{path}: {ending} is not a kind scanmap writes here; valid: {', '.join(suffixes)}")
+    try:
+        path.name.encode()
+    except UnicodeEncodeError as error:
+        raise ConfigError(f"{path}: maps and recordings name files in UTF-8, this is not: choose another") from error
     folder = path.parent
     if not folder.is_dir():
         raise ConfigError(f"{path} cannot be written: there is no folder {folder}; create it with mkdir -p {folder}")
