@@ -3,8 +3,10 @@
 # ruff: noqa: F401, F811 (fixtures of other test files)
 from __future__ import annotations
 
+import errno
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 from fake_cameras import as_jpeg, noisy, phone
 from test_cli import Run, one_line, run
 from test_hardware_scan import HARDWARE, Head, head
@@ -102,6 +105,26 @@ def test_a_full_disk_and_a_weak_laser_are_faults(monkeypatch: pytest.MonkeyPatch
     states = {finding.part: finding for finding in session.examine(choice, Path())}
     assert states["disk"].state == "fault" and "free some" in states["disk"].words
     assert states["rig"].state == "fault" and "makes no difference" in states["rig"].words
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.EACCES, r"you may not use it: join its group `dialout` \(`sudo usermod -aG dialout"),
+        (errno.EBUSY, r"another program holds it .*: close that one"),
+        (errno.ENOENT, r"it is not there; ports of this machine: none; plug the board in"),
+    ],
+)
+def test_a_port_that_cannot_be_opened_says_why_and_what_to_do(
+    run: Run, nothing_attached: None, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(number, f"could not open port: {os.strerror(number)}")
+
+    monkeypatch.setattr(serial, "serial_for_url", refuse)
+    said = run("doctor", "--set", "rig=hardware", "--set", "stage.port=/dev/ttyUSB7")
+    line = next(line for line in said.out.splitlines() if "board" in line)
+    assert said.code == 1 and line.startswith("FAULT") and re.search(f"/dev/ttyUSB7: cannot be opened: {words}", line)
 
 
 def test_modes_are_tried_one_by_one(head: Head) -> None:

@@ -6,8 +6,10 @@ Knows no firmware. Every port pyserial can open works: `/dev/ttyUSB0`, `COM3`, `
 
 from __future__ import annotations
 
+import errno
 import logging
 import time
+from pathlib import Path
 from typing import Any
 
 from scanmap.errors import StageError
@@ -138,12 +140,23 @@ def serial_devices() -> list[str]:
 
 
 def _why_not_open(url: str, error: Exception) -> str:
-    found = ", ".join(serial_devices()) or "none"
-    text = str(error)
-    if "Permission" in text or "Access is denied" in text:
-        advice = "add yourself to the group `dialout` (`sudo usermod -aG dialout $USER`, log in again)"
-    elif "lock" in text or "busy" in text:
-        advice = "another program holds it: close that one"
+    text, number = str(error), getattr(error, "errno", None)
+    if number in (errno.EACCES, errno.EPERM) or "Permission" in text or "Access is denied" in text:
+        group = _group_of(url)
+        why = f"you may not use it: join its group `{group}` (`sudo usermod -aG {group} $USER`) and log in again"
+    elif number in (errno.EBUSY, errno.EAGAIN) or "lock" in text or "busy" in text:
+        why = "another program holds it (Arduino IDE, ModemManager, a second scanmap?): close that one"
     else:
-        advice = f"ports of this machine: {found}; set stage.port, or try `scanmap doctor`"
-    return f"stage port {url!r} cannot be opened ({text}): {advice}"
+        found = ", ".join(serial_devices()) or "none; plug the board in, with a cable that carries data"
+        missing = number == errno.ENOENT or "FileNotFound" in text
+        why = f"{'it is not there' if missing else text}; ports of this machine: {found}; choose one with stage.port"
+    return f"stage port {url} cannot be opened: {why}"
+
+
+def _group_of(device: str) -> str:
+    """The group that may use a device: `dialout` on Debian and Fedora, `uucp` on Arch."""
+    try:
+        group = Path(device).group()
+    except (OSError, KeyError, NotImplementedError):
+        group = "root"
+    return "dialout" if group == "root" else group

@@ -87,7 +87,8 @@ def boards(config: Config, *, needed: bool) -> Iterator[Finding]:
             yield Finding("board", "ok", f"{port}: {identify(port, config.stage)}")
         except StageError as error:
             chosen = needed and config.stage.port == port
-            yield Finding("board", "fault" if chosen else "note", f"{port}: no GRBL board ({error})")
+            words = str(error).removeprefix(f"stage port {port} ").removeprefix(f"{port}: ")
+            yield Finding("board", "fault" if chosen else "note", f"{port}: {words}")
 
 
 def _head(choice: Choice, config: Config) -> tuple[Calibration | None, Finding]:
