@@ -32,7 +32,7 @@ class SteadyOutput:
 
     def write(self, text: str) -> int:
         """Write, or do nothing where nobody listens."""
-        self._attempt(lambda: sys.stdout.write(printable(text, sys.stdout.encoding)))
+        self._attempt(lambda: sys.stdout.write(printable(text, getattr(sys.stdout, "encoding", None))))
         return len(text)
 
     def flush(self) -> None:
@@ -84,7 +84,7 @@ def say(text: str) -> None:
 def complain(text: str) -> None:
     """One line on standard error, whatever line breaks the text has."""
     with suppress(OSError, ValueError, AttributeError):
-        print(printable(f"scanmap: {' '.join(text.split())}", sys.stderr.encoding), file=sys.stderr)
+        print(printable(f"scanmap: {' '.join(text.split())}", getattr(sys.stderr, "encoding", None)), file=sys.stderr)
 
 
 class _ToStderr(logging.Handler):
@@ -92,7 +92,7 @@ class _ToStderr(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError, ValueError, AttributeError):
-            print(printable(self.format(record), sys.stderr.encoding), file=sys.stderr)
+            print(printable(self.format(record), getattr(sys.stderr, "encoding", None)), file=sys.stderr)
 
 
 def set_up_logging(debug: bool) -> None:
