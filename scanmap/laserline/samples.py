@@ -26,7 +26,7 @@ _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
 _BRIGHTNESS = (0.16, 0.66, 0.34)
 # How far the mixture goes from there to the laser's own channel, at the least, and for each grey level of noise: more
 # averages noise, less the errors that all rows of an upright line share. All the way where colour is stored finely.
-_COLOUR, _COLOUR_PER_NOISE = 0.1, 0.2
+_COLOUR, _COLOUR_PER_NOISE = 0.1, 0.3
 _LIGHT = 0.12  # share of the laser's light that a neighbouring channel sees
 
 
