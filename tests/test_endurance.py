@@ -29,9 +29,10 @@ def held() -> tuple[int, int, int]:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
         if trim is not None:
             trim(0)
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    # Anonymous memory: pages of libraries come and go with what else the machine does.
+    status = Path("/proc/self/status").read_text()
     return (
-        pages * os.sysconf("SC_PAGE_SIZE") // 1024,
+        int(status.split("RssAnon:")[1].split()[0]),
         threading.active_count(),
         len(list(Path("/proc/self/fd").iterdir())),
     )
