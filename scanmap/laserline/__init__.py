@@ -2,7 +2,8 @@
 
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.grey import binary_image, overlay, to_grey
-from scanmap.laserline.line import LaserLineParams, find_laser_line, look, needs_colour
+from scanmap.laserline.line import find_laser_line, look
+from scanmap.laserline.params import LaserLineParams, needs_colour
 from scanmap.laserline.result import LaserLine, Look, Reason
 
 __all__ = [

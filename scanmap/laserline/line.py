@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import find_bars
@@ -18,8 +16,9 @@ from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import bright_core, centre_of_gravity
 from scanmap.laserline.edges import Edges, across_edges, doubt_of_edges, no_edges, sides_of
 from scanmap.laserline.flat import flat_tops
-from scanmap.laserline.grey import Grey, to_grey
+from scanmap.laserline.grey import to_grey
 from scanmap.laserline.offframe import standing_out
+from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
 from scanmap.laserline.pooling import TELLING, pool, segments, unexplained
@@ -53,36 +52,8 @@ _CORE_BIAS = 0.03
 # the sigmas to be believed, and may fall below them once they are known to be wrong; what is beyond the last is the
 # surface's own.
 _APART_ROWS, _MORE, _LESS, _MOST = (5, 6), 1.08, 0.5, 4.0
-
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
-
-
-class LaserLineParams(BaseModel, frozen=True, extra="forbid"):
-    """How a row's peak is found; `[laserline]` in a rig's TOML."""
-
-    method: Literal["gauss", "cog", "brightest"] = Field(
-        "gauss", description="gauss: fit at the noise bound; cog: centre of gravity; brightest: the thesis, exactly"
-    )
-    grey: Grey = Field("auto", description="plane the line is looked for in; auto: the channel where it stands out")
-    bit_index: int = Field(16, ge=0, le=24, description="for grey = bit_index: lowest of the 8 bits, 0 blue to 24")
-    noise: Literal["auto", "additive", "speckle"] = Field(
-        "auto", description="what scatters the samples; auto judges from the image"
-    )
-    min_peak: float = Field(
-        3.0, gt=0, le=255, description="least height of the line above its background [grey levels]"
-    )
-    min_snr: float = Field(6.0, ge=2, le=100, description="least signal to noise of the line in its row")
-    max_width_px: float = Field(12.0, gt=1, le=14, description="widest profile taken for the line, as sigma [px]")
-    off_threshold: float = Field(
-        0.0, ge=0, le=255, description="with a laser-off frame: differences below this count as none [grey levels]"
-    )
-    pool_rows: int = Field(0, ge=0, le=31, description="rows along the line that a column draws on; 0 = its own only")
-
-
-def needs_colour(params: LaserLineParams) -> bool:
-    """Whether the line is looked for in colour; if not, decoding to luminance (the JPEG's own plane) will do."""
-    return params.grey not in ("luminance_601", "ycbcr_y")
 
 
 def find_laser_line(
