@@ -25,7 +25,7 @@ from scanmap.calibration import Calibration
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import find_laser_line
-from scanmap.pipeline import Pipeline, Processes
+from scanmap.pipeline import Pipeline, Processes, SecondLook
 from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
 from scanmap.session.job import finished_scan
@@ -140,15 +140,17 @@ def main() -> None:
         decoding = {
             name: spent(partial(decode_all, decode, jpegs, options.frames)) for name, decode in decoders.items()
         }
-        scan = Scan(head.mount, HEIGHT)
+        scan, second_look = Scan(head.mount, HEIGHT), SecondLook(pipeline)
         worker_mb = []
 
         def replay() -> None:
             with Processes(pipeline) as workers:  # their start counts
-                workers.run(open_source(path).shots(), [lambda step: scan.add(step.profile, step.shot.bearing)])
+                sinks = [lambda step: scan.add(step.profile, step.shot.bearing), second_look]
+                workers.run(open_source(path).shots(), sinks)
                 worker_mb.extend(peak_mb(pid) for pid in workers.pids)
 
         replaying = spent(replay)
+        looking = spent(lambda: second_look.settle(scan, open_source(path).shots))
     clean: list[Scan] = []
     finish = spent(lambda: clean.append(finished_scan(scan, config)))
     grid = spent(lambda: OccupancyGrid.from_scan(clean[0], config.grid))
@@ -159,7 +161,9 @@ def main() -> None:
     ):
         ratios = "" if only is replaying else f"{replaying.wall / only.wall:27.2f} {replaying.cpu / only.cpu:5.2f}"
         print(f"{name:28s} {options.frames / only.wall:8.1f} {1e3 * only.cpu / options.frames:20.2f}{ratios}")
-    print(f"merge and filter {1e3 * finish.wall:.0f} ms, grid {1e3 * grid.wall:.0f} ms for {options.frames} bearings")
+    print(
+        f"second look {1e3 * looking.wall:.0f} ms, merge and filter {1e3 * finish.wall:.0f} ms, grid {1e3 * grid.wall:.0f} ms for {options.frames} bearings"
+    )
     print(f"peak memory {peak_mb(os.getpid()):.0f} MB, of the workers {', '.join(f'{mb:.0f}' for mb in worker_mb)} MB")
 
 
