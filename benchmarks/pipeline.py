@@ -162,7 +162,8 @@ def main() -> None:
         ratios = "" if only is replaying else f"{replaying.wall / only.wall:27.2f} {replaying.cpu / only.cpu:5.2f}"
         print(f"{name:28s} {options.frames / only.wall:8.1f} {1e3 * only.cpu / options.frames:20.2f}{ratios}")
     print(
-        f"second look {1e3 * looking.wall:.0f} ms, merge and filter {1e3 * finish.wall:.0f} ms, grid {1e3 * grid.wall:.0f} ms for {options.frames} bearings"
+        f"second look {1e3 * looking.wall:.0f} ms, merge and filter {1e3 * finish.wall:.0f} ms, "
+        f"grid {1e3 * grid.wall:.0f} ms for {options.frames} bearings"
     )
     print(f"peak memory {peak_mb(os.getpid()):.0f} MB, of the workers {', '.join(f'{mb:.0f}' for mb in worker_mb)} MB")
 
