@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from scanmap import config as configuration
 from scanmap import session
+from scanmap.calibration import Calibration
 from scanmap.errors import CalibrationError, ConfigError
+from scanmap.session import latency as measuring
 from scanmap.session.latency import laser_contrast, latency_by_blinks, latency_by_sweeps
 from scanmap.session.rigs import OpenRig, open_twin
-from scanmap.solvers.latency import Blink, Pass, latency_of_blinks, latency_of_sweeps, shift_between
+from scanmap.solvers.latency import Blink, Latency, Pass, latency_of_blinks, latency_of_sweeps, shift_between
 
 F64 = np.ndarray
 
@@ -101,8 +103,49 @@ def test_the_twins_latency_is_found_by_sweeps(twin: OpenRig) -> None:
     found = latency_by_sweeps(twin, config, config.head(), (6.0,), said.append)
     twin.close()
     assert found.latency_s == pytest.approx(0.08, abs=0.003)
-    assert said[0] == "sweeping forward and backward at 6 deg/s"
+    assert said[0] == "sweeping 30 to 50 deg and back at 6 deg/s"
     assert all(re.fullmatch(r"at -?\d+ deg, \d+ pictures", line) for line in said[1:])
+
+
+def test_a_sweep_for_the_latency_is_short_and_two_speeds_lie_far_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default twin's pictures are drawn small: nobody waits for ten thousand large ones."""
+    seen: list[tuple[float, ...]] = []
+
+    def swept(opened: OpenRig, config: configuration.Config, head: Calibration, speeds: tuple[float, ...],
+              progress: object, span_deg: float | None) -> Latency:  # fmt: skip
+        seen.append((opened.rig.camera.width, opened.rig.camera.height, *speeds))
+        return Latency(0.08, 0.001, 1)
+
+    monkeypatch.setattr(measuring, "latency_by_sweeps", swept)
+    for settings_ in ((), ("stage.speed_deg_s=8",), ("calibration.image.width=320", "calibration.image.height=240")):
+        session.measure_latency(session.Choice("twin-room", settings_), "sweep", (), lambda _: None)
+    assert seen == [(640, 480, 6.0, 18.0), (640, 480, 6.0, 3.0), (320, 240, 6.0, 18.0)]
+
+
+@pytest.mark.parametrize(
+    ("bearings", "span", "speed", "said"),
+    [
+        (("0", "180"), None, 6.0, "78 to 102"),
+        (("180", "0"), None, 1.0, "95 to 85"),
+        (("0", "180"), 60.0, 6.0, "60 to 120"),
+        (("30", "50"), 60.0, 6.0, "30 to 50"),
+    ],
+)
+def test_a_pass_is_about_the_middle_of_the_sweep(
+    bearings: tuple[str, str], span: float | None, speed: float, said: str
+) -> None:
+    config = configuration.load("twin-room", (f"sweep.start_deg={bearings[0]}", f"sweep.end_deg={bearings[1]}"))
+
+    class ToldError(Exception):
+        pass
+
+    def tell(line: str) -> None:
+        raise ToldError(line)
+
+    opened = open_twin(configuration.load("twin-room", SMALL), configuration.load("twin-room", SMALL).head())
+    with pytest.raises(ToldError, match=f"sweeping {said} deg and back at {speed:g} deg/s"):
+        latency_by_sweeps(opened, config, config.head(), (speed,), tell, span)
+    opened.close()
 
 
 @pytest.mark.slow  # the quick suite blinks in `doctor`

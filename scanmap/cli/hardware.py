@@ -35,7 +35,7 @@ def doctor(config: ConfigOption = None, set_: SetOption = None, calibration: Cal
     from scanmap import session
     from scanmap.cli.terminal import say, stop_on_signal
 
-    marks = {"ok": "ok   ", "note": "note ", "fault": "FAULT"}
+    marks = {"ok": "ok   ", "note": "note ", "fault": "FAULT", "busy": "...  "}
     faults = 0
     choice = session.Choice(config, tuple(set_ or ()), calibration)
     with stop_on_signal(), closing(session.examine(choice, Path.cwd())) as findings:

@@ -53,7 +53,7 @@ def self_(
     from scanmap.solvers.self_calibration import refine
 
     refuse_path(out)
-    _check_figure(figure)
+    refuse_file("--figure", figure, ".png")
     refuse_file("--rrd", rrd, ".rrd")
     measured, is_twin = _measure(recording, config, set_, calibration)
     with rounds_bar("making walls flat") as progress:
@@ -104,7 +104,7 @@ def check(
     from scanmap.solvers.check import check as judge
     from scanmap.solvers.walls import CheckParams
 
-    _check_figure(figure)
+    refuse_file("--figure", figure, ".png")
     refuse_file("--rrd", rrd, ".rrd")
     measured, _ = _measure(recording, config, set_, calibration)
     params = CheckParams(square=not not_square, wall_mm_per_m=wall_mm_per_m)
@@ -138,13 +138,6 @@ def _again(config: str | None, set_: list[str] | None) -> str:
     """The options that a following command needs too."""
     options = [] if config is None else [f" --config {shlex.quote(config)}"]
     return "".join([*options, *(f" --set {shlex.quote(one)}" for one in set_ or ())])
-
-
-def _check_figure(figure: Path | None) -> None:
-    from scanmap.errors import ConfigError
-
-    if figure is not None and (figure.suffix.lower() != ".png" or not figure.absolute().parent.is_dir()):
-        raise ConfigError(f"--figure {figure}: must be a .png in a folder that is there")
 
 
 def _measure(

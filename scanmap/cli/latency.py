@@ -28,7 +28,17 @@ def latency(
             min=0.1,
             max=360.0,
             metavar="SPEED",
-            help="Of the sweeps; two of them tell latency and backlash apart.",
+            help="Of the sweeps; two tell latency and backlash apart. Left out: sweep.speed_deg_s and thrice it.",
+        ),
+    ] = None,
+    span_deg: Annotated[
+        float | None,
+        typer.Option(
+            "--span-deg",
+            min=1.0,
+            max=3600.0,
+            metavar="SPAN",
+            help="Of the sweeps, about the middle of sweep.start_deg and end_deg; 4 s of turning if left out.",
         ),
     ] = None,
 ) -> None:
@@ -41,5 +51,5 @@ def latency(
 
     choice = session.Choice(config, tuple(set_ or ()), calibration)
     with stop_on_signal():
-        for line in session.measure_latency(choice, method, tuple(speed_deg_s or ()), say):
+        for line in session.measure_latency(choice, method, tuple(speed_deg_s or ()), say, span_deg):
             say(line)

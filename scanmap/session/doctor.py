@@ -24,17 +24,18 @@ from scanmap.shot import Shot
 from scanmap.sweep import plan
 
 TIMED_SHOTS = 6
+BLINKS = 8  # enough for a few milliseconds
 WEAK_CONTRAST_DN = 25.0  # [grey levels] below it the line is lost on dark things
 MB = 1e6
 
-State = Literal["ok", "note", "fault"]
+State = Literal["ok", "note", "fault", "busy"]
 
 
 class Finding(NamedTuple):
     """One thing that was looked at."""
 
     part: str  # camera, board, rig, laser, latency, disk, speed, calibration
-    state: State  # note: worth knowing, but nothing that this configuration needs
+    state: State  # note: worth knowing, but nothing that this configuration needs; busy: what it is about to do
     words: str
 
 
@@ -146,7 +147,8 @@ def _laser(opened: OpenRig, config: Config) -> Iterator[Finding]:
         yield Finding("laser", "note", "cannot be switched by software: it shines until you turn it off")
         return
     if isinstance(rig.camera, Streaming):
-        found, contrast = latency_by_blinks(opened, lambda _: None, blinks=8)
+        yield Finding("laser", "busy", f"blinking it {BLINKS} times")
+        found, contrast = latency_by_blinks(opened, lambda _: None, BLINKS)
     else:
         found, contrast = None, laser_contrast(rig)
     words = f"on and off differ by {contrast.level_dn:.0f} grey levels in {contrast.lit_px} pixels"

@@ -28,6 +28,9 @@ CONTRAST_DN = 12.0  # [grey levels] a pixel belongs to the line if the laser add
 LEAST_LIT = 30  # pixels
 ROWS = 240  # of an image are enough
 LINE_EVERY_S = 5.0  # so much silence at most
+PASS_S = 4.0  # a pass of the sweeps lasts: twice the shift that the latest camera searched for would make
+LEAST_SPAN_DEG = 10.0  # of a pass, however slow: corners and furniture must come by
+TWIN_WIDTH = 640  # of the twin's pictures here [px]: latency does not depend on their size, the time to draw them does
 
 Progress = Callable[[str], None]
 
@@ -43,14 +46,21 @@ class Contrast:
     off: float
 
 
-def measure_latency(choice: Choice, method: str, speeds_deg_s: tuple[float, ...], progress: Progress) -> list[str]:
+def measure_latency(
+    choice: Choice, method: str, speeds_deg_s: tuple[float, ...], progress: Progress, span_deg: float | None = None
+) -> list[str]:
     """Open the rig, measure by `sweep` or `blink`, close it; the result in lines.
+
+    Args:
+        span_deg: of each pass, about the middle of the configured sweep; None = as `latency_by_sweeps` chooses.
 
     Raises:
         ConfigError, CalibrationError, CameraError, StageError: as `latency_by_sweeps` and `latency_by_blinks`.
     """
     config = choice.load()
     head = choice.head() or config.head()
+    if config.rig == "twin":
+        head = _smaller(head)
     opened = open_rig(config, head)
     try:
         progress(rig_words(config, opened.rig))
@@ -58,8 +68,8 @@ def measure_latency(choice: Choice, method: str, speeds_deg_s: tuple[float, ...]
             found, contrast = latency_by_blinks(opened, progress)
             about = f"laser on and off differ by {contrast.level_dn:.0f} grey levels in {contrast.lit_px} pixels"
         else:
-            speeds = speeds_deg_s or (config.sweep.speed_deg_s, config.sweep.speed_deg_s / 2)
-            found = latency_by_sweeps(opened, config, head, speeds, progress)
+            speeds = speeds_deg_s or _two_speeds(config.sweep.speed_deg_s, config.stage.speed_deg_s)
+            found = latency_by_sweeps(opened, config, head, speeds, progress, span_deg)
             about = f"play of the gear: {found.backlash_deg:.3f} deg" if len(set(speeds)) > 1 else ""
     finally:
         opened.close()
@@ -77,13 +87,20 @@ def measure_latency(choice: Choice, method: str, speeds_deg_s: tuple[float, ...]
 
 
 def latency_by_sweeps(
-    opened: OpenRig, config: Config, calibration: Calibration, speeds_deg_s: tuple[float, ...], progress: Progress
+    opened: OpenRig,
+    config: Config,
+    calibration: Calibration,
+    speeds_deg_s: tuple[float, ...],
+    progress: Progress,
+    span_deg: float | None = None,
 ) -> Latency:
     """Sweep forward and backward at each speed and see by how much the two differ.
 
     Args:
         speeds_deg_s: two tell latency and backlash apart.
         progress: gets a line about every sweep.
+        span_deg: of each pass, about the middle of the configured sweep and never beyond it; None = 4 s of turning,
+            10 deg at least.
 
     Raises:
         ConfigError: the stage cannot turn steadily.
@@ -96,9 +113,11 @@ def latency_by_sweeps(
     every = max(1, calibration.intrinsics.height // ROWS)
     passes = []
     for speed in speeds_deg_s:
-        progress(f"sweeping forward and backward at {speed:g} deg/s")
+        start_deg, end_deg = _middle(config.sweep, span_deg or max(LEAST_SPAN_DEG, PASS_S * speed))
+        progress(f"sweeping {start_deg:g} to {end_deg:g} deg and back at {speed:g} deg/s")
         plan = config.sweep.model_dump() | {
             "mode": "continuous", "passes": 2, "speed_deg_s": speed, "step_deg": 0.01, "off_frames": False,
+            "start_deg": start_deg, "end_deg": end_deg, "exposures_us": (),
         }  # fmt: skip
         bearings, columns = [], []
         spoken = time.monotonic()
@@ -110,6 +129,26 @@ def latency_by_sweeps(
                 progress(f"at {math.degrees(shot.bearing):.0f} deg, {len(bearings)} pictures")
         passes.append((math.radians(speed), *_two_passes(np.array(bearings), np.array(columns))))
     return latency_of_sweeps(passes)
+
+
+def _smaller(head: Calibration) -> Calibration:
+    """The twin's head with pictures at most `TWIN_WIDTH` wide."""
+    own = head.intrinsics
+    return head if own.width <= TWIN_WIDTH else head.scaled_to(TWIN_WIDTH, round(own.height * TWIN_WIDTH / own.width))
+
+
+def _two_speeds(wanted_deg_s: float, fastest_deg_s: float) -> tuple[float, float]:
+    """That of the sweep and thrice it: the farther apart, the better they tell latency from backlash."""
+    faster = min(3 * wanted_deg_s, fastest_deg_s)
+    return (wanted_deg_s, faster) if faster > 1.5 * wanted_deg_s else (wanted_deg_s, wanted_deg_s / 2)
+
+
+def _middle(sweep: SweepParams, span_deg: float) -> tuple[float, float]:
+    """First and last bearing [deg] of at most `span_deg` about the middle of a sweep, in its direction."""
+    whole = sweep.end_deg - sweep.start_deg
+    half = math.copysign(min(abs(whole), span_deg) / 2, whole)
+    middle = (sweep.start_deg + sweep.end_deg) / 2
+    return middle - half, middle + half
 
 
 def latency_by_blinks(opened: OpenRig, progress: Progress, blinks: int = BLINKS) -> tuple[Latency, Contrast]:
@@ -175,14 +214,25 @@ def _blink(opened: OpenRig, camera: Streaming, contrast: Contrast, phase_s: floa
     while frames[-1].time < after + REST_S:
         frames.append(camera.newest())
     spread = contrast.on - contrast.off
-    levels = [(float(_brightness(frame)[contrast.mask].mean()) - contrast.off) / spread for frame in frames]
+    levels = [(_mean_of_lit(frame, contrast.mask) - contrast.off) / spread for frame in frames]
     return Blink((before + after) / 2, np.array([frame.time for frame in frames]), np.array(levels))
 
 
 def _brightness(frame: Frame) -> NDArray[np.uint8]:
     """(H, W) the brightest channel of each pixel: a red line is bright in red."""
-    image = decode_image(frame.image).image
-    return image if image.ndim == 2 else np.asarray(image.max(axis=2), np.uint8)
+    return _brightest(decode_image(frame.image).image)
+
+
+def _mean_of_lit(frame: Frame, mask: NDArray[np.bool_]) -> float:
+    """Mean brightness of the pixels in the mask alone: they are one in a hundred."""
+    return float(_brightest(decode_image(frame.image).image[mask][:, None]).mean())
+
+
+def _brightest(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if pixels.ndim == 2:
+        return pixels
+    # By channel: a reduction over so short an axis costs ten times as much.
+    return np.maximum(np.maximum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
 
 
 def _period(camera: Streaming) -> float:

@@ -155,7 +155,8 @@ def _best_shift(front: Pass, back: Pass, most: float) -> float:
         costs = [_cost(front, back, shift) for shift in trials]
         if not np.isfinite(costs).any():
             raise CalibrationError(
-                "the laser line is seen in too few rows in both directions: sweep a larger part of a furnished room"
+                "the laser line is seen in too few rows in both directions: point the middle of the sweep at "
+                "furniture, or sweep more of the room (--span-deg)"
             )
         middle = float(trials[int(np.nanargmin(costs))])
         reach, steps = 2 * reach / (steps - 1) * 2, STEPS_ROUND
@@ -178,14 +179,18 @@ def _refined(front: Pass, back: Pass, shift: float) -> tuple[float, int]:
         r, g = difference[known], slope[known]
         pairs = int(known.sum())
         if pairs <= LEAST_PAIRS:
-            raise CalibrationError("the laser line is seen in too few rows in both directions: sweep a larger part")
+            raise CalibrationError(
+                "the laser line is seen in too few rows in both directions: sweep more of the room (--span-deg)"
+            )
         scale = max(1.4826 * float(np.median(np.abs(r))), 0.02)
         weight = np.clip(1.0 - (r / (TUKEY * scale)) ** 2, 0.0, None) ** 2
         # Rows along which nothing changes say nothing, depth edges would say too much.
         g = np.clip(g, -3 * np.median(np.abs(g)) - 1.0, 3 * np.median(np.abs(g)) + 1.0)
         bottom = float((weight * g * g).sum())
         if bottom <= 0:
-            raise CalibrationError("nothing in view changes with the bearing: sweep past corners and furniture")
+            raise CalibrationError(
+                "nothing in view changes with the bearing: sweep past corners and furniture (--span-deg)"
+            )
         shift -= float((weight * g * r).sum()) / bottom
     return shift, pairs
 
