@@ -144,8 +144,10 @@ def _read(name: str) -> tuple[str, str, Path | None]:
         preset = path.stem if path.suffix == ".toml" and path.parent.name in ("", "configs") else name
         if preset in preset_names():
             return (_presets() / f"{preset}.toml").read_text(encoding="utf-8"), f"preset {preset}", None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"configuration {name} cannot be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"configuration {name} cannot be read: it is not UTF-8 text") from error
+    except OSError as error:
+        raise ConfigError(f"configuration {name} cannot be read: {error.strerror or error}") from error
     raise ConfigError(f"no configuration {name}: neither a file nor one of the presets {', '.join(preset_names())}")
 
 

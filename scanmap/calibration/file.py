@@ -19,13 +19,20 @@ Array = NDArray[np.float64]
 
 # Camera axes (x right, y down, z forward) seen in the head frame of a camera that looks along head x.
 R_HEAD_CAMERA_FORWARD: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+RIG_KEYS = frozenset({"rig", "sweep", "camera", "stage", "twin"})  # what tells a rig's TOML
 
 
 def parse(text: str, source: str) -> Calibration:
     """`Calibration.loads`."""
     try:
+        document = tomllib.loads(text)
+        if "image" not in document and RIG_KEYS & document.keys():
+            raise CalibrationError(
+                f"{source} is the configuration of a rig, not a calibration: give it with --config, and leave "
+                "--calibration out to take the one in it"
+            )
         # Strictly, so that text is never taken for a number; a TOML array is a tuple here.
-        return CalibrationFile.model_validate(_with_tuples(tomllib.loads(text)), strict=True).build()
+        return CalibrationFile.model_validate(_with_tuples(document), strict=True).build()
     except tomllib.TOMLDecodeError as error:
         raise CalibrationError(f"{source} is not valid TOML: {error}") from error
     except ValidationError as error:

@@ -14,7 +14,7 @@ from scanmap.errors import CalibrationError, ConfigError
 
 def refuse_path(path: Path) -> None:
     """Raise ConfigError where no calibration can be written; before anything is measured or solved."""
-    if path.suffix.lower() != ".toml":
+    if path.suffix.lower() != ".toml" and not path.is_dir():
         raise ConfigError(f"--out {path}: a calibration must end in .toml; try {path.with_suffix('.toml')}")
     refuse_file("--out", path)
 
@@ -23,10 +23,10 @@ def refuse_file(option: str, path: Path | None, suffix: str = "") -> None:
     """Raise ConfigError where `path` cannot be written, or does not end in `suffix` if one is asked for."""
     if path is None:
         return
-    if suffix and path.suffix.lower() != suffix:
-        raise ConfigError(f"{option} {path}: must end in {suffix}; try {path.with_suffix(suffix)}")
     if path.is_dir():
         raise ConfigError(f"{option} {path} is a folder; give the name of a file in it")
+    if suffix and path.suffix.lower() != suffix:
+        raise ConfigError(f"{option} {path}: must end in {suffix}; try {path.with_suffix(suffix)}")
     folder = path.absolute().parent
     if not folder.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {folder}; make it first")

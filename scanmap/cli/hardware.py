@@ -92,7 +92,7 @@ def init(
             say(line)
 
 
-@stage.command()
+@stage.command(context_settings={"ignore_unknown_options": True})  # -5 is an angle, not an option
 def jog(
     by_deg: Annotated[
         float | None, typer.Argument(metavar="[DEG]", help="Turn by so much; negative is clockwise [deg].")
@@ -107,7 +107,7 @@ def jog(
 
     scanmap stage jog --to 90 --config my-rig.toml
 
-    scanmap stage jog --config my-rig.toml -- -5
+    scanmap stage jog -5 --config my-rig.toml
     """
     from scanmap import session
     from scanmap.cli.terminal import say

@@ -39,6 +39,7 @@ def view(
     scanmap view --live 9876
     """
     from scanmap import session
+    from scanmap.calibration.keeping import refuse_file
     from scanmap.cli.report import progress_bar
     from scanmap.cli.terminal import say, stop_on_signal
     from scanmap.errors import ConfigError, RecordingError
@@ -55,8 +56,11 @@ def view(
             raise ConfigError(f"--save makes an .rrd of a recording, a folder or a video; {source} is none")
         session.show_as_it_is(source)
         return
+    refuse_file("--save", save, ".rrd")
     choice = session.Choice(config, tuple(set_ or ()), calibration)
     with stop_on_signal() as stop, session.prepare_view(source, choice, save) as job:
+        for line in job.announcement:
+            say(line)
         with progress_bar("reading", job.total) as progress:
             result = job.run(progress, stop.orderly("stopping: what was read so far is shown"))
         for fault in result.faults:
@@ -100,9 +104,11 @@ def make_map(
     Example: scanmap map room.mcap --out room.yaml --resolution-m 0.05 --height-m 0.1:1.8
     """
     from scanmap import session
+    from scanmap.calibration.keeping import refuse_file
     from scanmap.cli.report import progress_bar
     from scanmap.cli.terminal import say, stop_on_signal
 
+    refuse_file("--out", out, ".yaml")
     settings = (*(set_ or ()), *session.map_settings(resolution_m, height_m))
     outputs = session.Outputs(map=out, map_image=image, map_mode=mode)
     choice = session.Choice(config, settings, calibration)

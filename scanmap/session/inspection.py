@@ -116,4 +116,9 @@ def grid_lines(grid: OccupancyGrid) -> list[str]:
         f"({grid.origin[0]:.3f}, {grid.origin[1]:.3f}) m",
         "cells: " + ", ".join(f"{name} {share:.1f} %" for name, share in shares.items()),
     ]
+    if not (grid.occupied.any() or grid.free.any()):
+        lines.append(
+            "nothing was seen at these heights above the floor, so the whole map is unknown: see grid.height_low_m and "
+            "grid.height_high_m (--height-m LOW:HIGH)"
+        )
     return lines + ([grid.floor.words] if grid.floor is not None else [])

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from scanmap.calibration.keeping import refuse_file
 from scanmap.config import Config, parse
 from scanmap.errors import CameraError, ConfigError, StageError
 from scanmap.rig.camera import CameraParams, camera_devices, open_camera
@@ -92,6 +93,7 @@ def first_config(
     """
     if path.exists():
         raise ConfigError(f"{path} exists and is not overwritten: choose another --out, or move it away")
+    refuse_file("--out", path, ".toml")
     _configuration(Found("auto", DEFAULT_SIZE, "auto", []), drive, head, laser)  # numbers that make no rig: said now
     found = look_around()
     yield from found.lines

@@ -70,8 +70,8 @@ def prepare_scan(choice: Choice, outputs: Outputs, *, view: bool, resume: Path |
     config = earlier.config if earlier is not None else choice.load()
     if config.rig == "replay-only":
         raise ConfigError(
-            f"configuration {choice.config} has rig = {config.rig!r}: it describes recordings, not a rig that is here; "
-            f"try scanmap replay SOURCE --config {choice.config}"
+            f"rig = {config.rig!r} describes recordings, not a rig that is here; try scanmap replay SOURCE"
+            + (f" --config {choice.config}" if choice.config else ", or set rig = 'hardware' or 'twin'")
         )
     if earlier is not None:
         outputs = replace(outputs, record=earlier.part)

@@ -101,7 +101,8 @@ def _is_complete(planned: Plan, done: frozenset[int]) -> bool:
 
 def _check(path: Path, settings: tuple[str, ...]) -> None:
     if path.suffix != ".mcap" or not path.is_file():
-        raise ConfigError(f"--resume {path}: not the recording (.mcap) of a scan")
+        why = "" if path.exists() else ": there is no such file"
+        raise ConfigError(f"--resume {path}: not the recording (.mcap) of a scan{why}")
     if is_later_part(path):
         raise ConfigError(f"--resume {path}: name the file that the scan began in, not a later part")
     for setting in settings:

@@ -37,6 +37,8 @@ def draw_sheet(board: Board, path: Path, paper: str = "a4") -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    if path.is_dir():
+        raise ConfigError(f"--out {path} is a folder; give the name of a .pdf or .png in it")
     if path.suffix.lower() not in (".pdf", ".png"):
         raise ConfigError(f"--out {path}: a board is written as .pdf or .png; try {path.with_suffix('.pdf')}")
     width, height = _paper_for(board, paper)
