@@ -217,7 +217,8 @@ def test_the_command_writes_beside_the_old_one_and_says_what_it_saw(
     before = out.read_bytes()
     for words, complaint in (
         ((str(tmp_path / "none.mcap"), "--out", str(out)), "does not exist"),
-        ((str(recording), "--out", str(tmp_path)), "must end in .toml"),
+        ((str(recording), "--out", str(tmp_path)), "is a folder"),
+        ((str(recording), "--out", str(tmp_path / "head.ply")), "must end in .toml"),
         ((str(recording), "--calibration", str(out), "--out", str(out), "--figure", "walls.jpg"), "must end in .png"),
         (
             (str(recording), "--out", str(out), "--figure", "/proc/walls.png"),
