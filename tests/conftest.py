@@ -1,13 +1,14 @@
 """Shared by the tests: data beside the checkout, and one small scan of the twin."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from scanmap import session
+from scanmap.cli import main
 from scanmap.twin.light import LightParams
 from scanmap.twin.scene import RoomParams, Scene, build_scene
 
@@ -46,6 +47,22 @@ def baked_scene(params: RoomParams, light: LightParams | None = None) -> Scene:
 def baked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every twin that is opened has a `baked_scene`."""
     monkeypatch.setattr("scanmap.session.rigs.build_scene", baked_scene)
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str, str]]:
+    """Run a command in an empty folder; gives exit code, output, errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(list(words))
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), said.out, said.err
+
+    return call
 
 
 class TwinScan:

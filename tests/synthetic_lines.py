@@ -5,13 +5,15 @@ Light is added up in grey levels as floats, (H, W, 3) in BGR, and becomes a pict
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from scanmap.laserline import LaserLineParams, find_laser_line
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -88,6 +90,20 @@ def clean(spec: LineSpec, rng: np.random.Generator) -> tuple[U8, F64]:
         line[lit] *= 1.0 + spec.speckle * rng.standard_normal(int(lit.sum()), np.float32)
     light = line if spec.colour is None else line[..., None] * np.float32(spec.colour)
     return sensor(light + np.float32(spec.background), spec.noise, rng), column
+
+
+EACH_ROW = LaserLineParams()
+
+
+def errors(spec: LineSpec, params: LaserLineParams = EACH_ROW, seeds: Iterable[int] = range(3)) -> tuple[F64, F64]:
+    """Errors [px] and errors over sigma_px of all rows of several frames; NaN where no line was found."""
+    off, scaled = [], []
+    for seed in seeds:
+        image, truth = clean(spec, np.random.default_rng(seed))
+        line = find_laser_line(image, params)
+        off.append(line.column_px - truth)
+        scaled.append(off[-1] / line.sigma_px)
+    return np.concatenate(off), np.concatenate(scaled)
 
 
 def line_light(column: F64, peak: float | F64, sigma: float | F64, width: int) -> F32:

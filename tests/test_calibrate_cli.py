@@ -9,25 +9,10 @@ import pytest
 from boards_by_projection import Head, axis_pictures, laser_pose, picture_of, random_pose
 
 from scanmap.calibration import Calibration, uncertainty_of
-from scanmap.cli import main
 from scanmap.solvers.board import parse_board
 
 BOARD = "chessboard:8x6:30mm"
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run a command in an empty folder; gives exit code, output, errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(list(words))
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
-
-    return call
 
 
 def one_line(text: str) -> bool:

@@ -13,7 +13,6 @@ from boards_by_projection import Head, axis_poses, laser_pose, picture_of, rando
 from fake_cameras import FakeCapture, FakeDevice, as_jpeg, phone
 
 from scanmap.calibration import Calibration
-from scanmap.cli import main
 from scanmap.cli.collecting import Collecting
 from scanmap.rig import grbl_opening
 from scanmap.solvers.board import parse_board
@@ -72,19 +71,6 @@ def room(monkeypatch: pytest.MonkeyPatch) -> Room:
 
     monkeypatch.setattr(Collecting, "__call__", told)
     return room
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(list(words))
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
-
-    return call
 
 
 @pytest.fixture

@@ -6,24 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic_lines import GREEN, HARD, RED, LineSpec, bound, clean, hard_frame, line_light, score, sensor
+from synthetic_lines import GREEN, HARD, RED, LineSpec, bound, clean, errors, hard_frame, line_light, score, sensor
 
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
 from scanmap.laserline.channel import laser_channel
 
 GAUSS = LaserLineParams()
 POOLED = LaserLineParams(pool_rows=9)
-
-
-def errors(spec, params=GAUSS, seeds=range(3)):
-    """Errors [px] and errors over sigma_px of all rows of several frames; NaN where no line was found."""
-    off, scaled = [], []
-    for seed in seeds:
-        image, truth = clean(spec, np.random.default_rng(seed))
-        line = find_laser_line(image, params)
-        off.append(line.column_px - truth)
-        scaled.append(off[-1] / line.sigma_px)
-    return np.concatenate(off), np.concatenate(scaled)
 
 
 def rms(values):

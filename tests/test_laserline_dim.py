@@ -2,23 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic_lines import LineSpec, bound, clean, line_light, sensor
+from synthetic_lines import LineSpec, bound, errors, line_light, sensor
 
 from scanmap.laserline import LaserLineParams, find_laser_line
 from scanmap.laserline.pooling import pool
 
 ALONE, POOLED = LaserLineParams(), LaserLineParams(pool_rows=9)
-
-
-def errors(spec, params, seeds):
-    """Errors [px] and errors over sigma_px of all rows."""
-    off, scaled = [], []
-    for seed in seeds:
-        image, truth = clean(spec, np.random.default_rng(seed))
-        line = find_laser_line(image, params)
-        off.append(line.column_px - truth)
-        scaled.append(off[-1] / line.sigma_px)
-    return np.concatenate(off), np.concatenate(scaled)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,6 @@ from scanmap.errors import CameraError
 WIDTH = 400  # [px] pictures are made at most this wide
 LINE_PX = 12  # to either side of a row's brightest pixel, of the reduced picture
 BLUR_PX, BROAD_PX = 1.0, 8.0  # noise is finer than what is compared; a laser line narrower than its surroundings
-LINE_DN = 15.0  # [grey levels] by which a line stands out at least
-ELSEWHERE = 0.05  # share of the rows whose line may be elsewhere in pictures of one place: speckle, noise
 SURE = 6.0  # standard deviations; the highest of 10^5 values of pure noise reaches 5
 ALIKE = 0.45  # true pairs of the twin's rooms have 0.55 and more, chance likenesses 0.32 at most
 ALIKE_BLUR_PX = 2.0
@@ -123,19 +121,6 @@ def scale_of(width: int) -> float:
     return max(1.0, width / WIDTH)
 
 
-def same_line(before: bytes, after: bytes) -> bool:
-    """Whether two encoded pictures show the laser line, or whatever is brightest, in the same columns.
-
-    Raises:
-        CameraError: a picture cannot be decoded.
-    """
-    first, second = (_brightest(_small(image)[0]) for image in (before, after))
-    if first.shape != second.shape:
-        return False
-    seen = np.isfinite(first) & np.isfinite(second)
-    return bool(seen.any() and (np.abs(first - second)[seen] > 1.0).mean() < ELSEWHERE)
-
-
 @lru_cache(maxsize=KEPT)
 def _structure(image: bytes) -> tuple[F32, float]:
     """Edges and textures (h, w) of a picture, small and without the laser line; and how many pixels make one."""
@@ -154,12 +139,6 @@ def _line(small: F32) -> NDArray[np.bool_]:
     columns = np.arange(small.shape[1])
     near: NDArray[np.bool_] = np.abs(columns - _sharp(small).argmax(axis=1)[:, None]) <= LINE_PX
     return near
-
-
-def _brightest(small: F32) -> F32:
-    """(h,) column of the brightest thing of each row; NaN where nothing stands out."""
-    sharp = _sharp(small)
-    return np.where(sharp.max(axis=1) > LINE_DN, sharp.argmax(axis=1), np.nan).astype(np.float32)
 
 
 def _sharp(small: F32) -> F32:
