@@ -34,6 +34,28 @@ def test_a_table_top_is_not_the_floor_though_it_has_more_points():
     assert find_floor(scan).laser_height_m == pytest.approx(1.0, abs=0.002)
 
 
+def test_two_tables_of_different_heights_are_no_leaning_layer():
+    """A plane through both tops holds more points than the strip of floor that a narrow lens sees behind them."""
+    tables = [((0.91, -1.301, 0.626), (1.71, -0.501, 0.656)), ((1.256, -0.026, 0.707), (2.056, 0.774, 0.737))]
+    boxes = [
+        ((1.839, -1.483, 0.0), (3.3, -1.183, 0.336)),
+        ((2.3, 1.104, 0.0), (3.3, 1.404, 0.385)),
+        ((2.042, 0.685, 0.0), (3.3, 0.985, 0.426)),
+    ]
+    scan = scan_room(
+        np.arange(-60, 61),
+        ((-2.0, -2.5, 0.0), (3.11, 2.5, 2.6)),
+        tables + boxes,
+        rows=500,
+        half_view_deg=19.5,
+        noise=3e-4,
+        rng=np.random.default_rng(162),
+    )
+    floor = find_floor(scan)
+    assert (floor.how, floor.tilt_deg < 0.2) == ("fitted", True)
+    assert floor.laser_height_m == pytest.approx(1.0, abs=0.003)
+
+
 def test_a_single_bearing_gives_the_height_and_does_not_invent_a_tilt():
     floor = find_floor(scan_room(np.array([0.0]), ((-2, -1.5, 0), (5, 2.5, 2.6)), rows=600))
     assert (floor.how, floor.tilt_deg < 0.05) == ("fitted", True)

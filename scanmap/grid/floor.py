@@ -78,8 +78,12 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
     low = level & (points[:, 2] < -0.02)
     if low.sum() >= _MIN_SUPPORT:
         # Floor, table and shelf are parallel: the strongest layer tells the tilt, the lowest strong one is the floor.
-        # A leaning layer may gather bits of several things; upright counts where it explains more points.
-        tries = [_settled(points[low], sigma[low], np.radians(tilt)) for tilt in (max_tilt_deg, 0.0)]
+        # But a leaning layer may be made of bits of several things, two tables for one: what explains most counts.
+        tries = [
+            _settled(points[low], sigma[low], np.radians(tilt), refined)
+            for tilt in (max_tilt_deg, 0.0)
+            for refined in (True, False)
+        ]
         slope, inliers, rms = max(tries, key=lambda found: found[1] * (_share_below(points, found[0]) < _MAX_BELOW))
         steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
         above_others = _share_below(points, slope) >= _MAX_BELOW
@@ -97,10 +101,13 @@ def _share_below(points: Array, slope: Array) -> float:
     return float((height < -_CLEARLY_BELOW_M).mean())
 
 
-def _settled(points: Array, sigma: Array, max_tilt: float) -> tuple[Array, int, float]:
-    """The lowest strong layer parallel to the strongest one: slope (3,), number of inliers, their rms [m]."""
+def _settled(points: Array, sigma: Array, max_tilt: float, refined: bool) -> tuple[Array, int, float]:
+    """The lowest strong layer parallel to the strongest one: slope (3,), number of inliers, their rms [m].
+
+    `refined`: the strongest layer's tilt is that of a plane fitted to it, else the coarse one it was found with.
+    """
     seed = _strongest_layer(points, max_tilt)
-    seed[2] = _lowest_layer(points, _refine(points, sigma, seed)[0])
+    seed[2] = _lowest_layer(points, _refine(points, sigma, seed)[0] if refined else seed)
     return _refine(points, sigma, seed)
 
 
