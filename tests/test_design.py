@@ -91,3 +91,9 @@ def test_a_head_can_be_given_without_any_file(capsys: pytest.CaptureFixture[str]
     ):
         code, _, said = run(capsys, *words)
         assert code == 2 and complaint in said and said.count("\n") == 1
+
+
+def test_a_head_for_things_in_the_hand_is_not_compared_where_it_sees_nothing() -> None:
+    near = evaluate("head", head(baseline_m=0.05, beta_deg=60.0, alpha_deg=10.0), LIMITS, 0.1)
+    assert near.farthest_m < 0.3
+    assert near.model_error == "nothing in view from 0.3 to 3 m to compare the thesis's models by"

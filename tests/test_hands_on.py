@@ -301,7 +301,7 @@ def test_a_first_configuration_loads_and_is_never_overwritten(
     one_line(run("init", "--out", "my-rig.toml"), 2, "my-rig.toml exists and is not overwritten")
     assert (tmp_path / "my-rig.toml").read_bytes() == before
     one_line(run("init", "--out", "my-rig.yaml"), 2, "my-rig.toml")
-    one_line(run("init", "--out", "x.toml", "--gear", "-1"), 2, "steps_per_deg")
+    one_line(run("init", "--out", "x.toml", "--gear", "-1"), 2, "--gear")
     one_line(run("init", "--out", "nowhere/x.toml"), 2, "nowhere")
     for options in (("--gear", "nan"), ("--gear", "inf"), ("--gear", "0"), ("--baseline-m", "nan")):
         said = run("init", "--out", "x.toml", *options)

@@ -55,6 +55,30 @@ def test_what_is_written_reads_back_cell_by_cell(tmp_path_factory, odds, form):
     assert (again.origin, again.resolution_m) == (grid.origin, grid.resolution_m)
 
 
+@pytest.mark.parametrize("form", [("pgm", "trinary"), ("png", "trinary"), ("png", "scale")])
+def test_other_programs_see_the_map_at_its_place(tmp_path, form):
+    """Read by Pillow and a YAML library, nav2_map_server's rules written out; nothing of ours but the file."""
+    from PIL import Image
+    from ruamel.yaml import YAML
+
+    grid = grid_of(np.random.default_rng(4).choice([-2.0, -0.3, 0.0, 0.1, 3.5], (7, 11)))
+    save_map(grid, tmp_path / "m.yaml", *form)
+    about = YAML(typ="safe").load(tmp_path / "m.yaml")
+    with Image.open(tmp_path / about["image"]) as image:
+        assert image.size == (11, 7)
+        pixels = np.asarray(image.convert("RGBA"), np.float64)
+    occupancy = 1.0 - pixels[..., :3].mean(axis=2) / 255.0
+    occupied, free = occupancy > about["occupied_thresh"], occupancy < about["free_thresh"]
+    hidden = pixels[..., 3] < 255 if about["mode"] == "scale" else np.zeros_like(occupied)
+    rows, cols = np.indices(grid.shape)
+    x = about["origin"][0] + (cols + 0.5) * about["resolution"]
+    y = about["origin"][1] + (rows[::-1] + 0.5) * about["resolution"]  # the image's first row is the highest y
+    for row, col in np.ndindex(grid.shape):
+        at = grid.index(x[row, col], y[row, col])
+        seen = (occupied & ~hidden)[row, col], (free & ~hidden)[row, col]
+        assert seen == (grid.occupied[at], grid.free[at])
+
+
 def test_unknown_is_never_read_back_as_free(tmp_path):
     grid = grid_of(np.zeros((4, 5)))
     for form in (("pgm", "trinary"), ("png", "scale")):

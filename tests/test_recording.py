@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recorded_shots import CALIBRATION, START_NS, made_up_shots, record
 
+from scanmap.calibration import Calibration
 from scanmap.errors import CalibrationError, RecordingError
 from scanmap.recording import Recorder, RecordingParams, describe, open_source, whole_ns
 from scanmap.shot import Shot
@@ -164,6 +165,26 @@ def test_others_readers_read_every_message(tmp_path: Path) -> None:
     info = seen["/camera/camera_info"][0]
     assert (info.width, info.height) == (64, 48)
     assert np.array_equal(info.k.reshape(3, 3), CALIBRATION.intrinsics.matrix)
+
+
+def test_the_mcap_library_finds_every_crc_right_and_all_that_came_along(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    shots = made_up_shots(7, off=True)
+    path = record(tmp_path / "a.mcap", shots, rig_toml="[sweep]\nstep_deg = 1.0\n", plan={"shots": "7"})
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        counts = {c.topic: summary.statistics.channel_message_counts.get(k, 0) for k, c in summary.channels.items()}
+        kept = {a.name: a.data.decode() for a in reader.iter_attachments()}
+        metadata = {record.name for record in reader.iter_metadata()}
+        messages = list(reader.iter_messages())
+    assert counts["/camera/image/compressed"] == counts["/camera/off/compressed"] == counts["/joint_states"] == 7
+    assert len(messages) == summary.statistics.message_count == sum(counts.values())
+    assert len({message.log_time for _, channel, message in messages if channel.topic == "/joint_states"}) == 7
+    assert kept["rig.toml"] == "[sweep]\nstep_deg = 1.0\n"
+    assert Calibration.loads(kept["calibration.toml"]).dumps() == CALIBRATION.dumps()
+    assert metadata and summary.statistics.metadata_count >= len(metadata)
 
 
 def test_static_transforms_place_the_camera_where_the_calibration_does(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from scanmap.cli.calibrating import CalibrationOut, say_written
+from scanmap.cli.calibrating import CalibrationOut
 
 
 def board(
@@ -49,7 +49,7 @@ def scale(
     """
     from scanmap.calibration import Calibration
     from scanmap.calibration.keeping import refuse_path, save_beside
-    from scanmap.cli.terminal import say
+    from scanmap.cli.terminal import say, say_written
     from scanmap.errors import ConfigError
 
     width, x, height = size.partition("x")

@@ -95,7 +95,9 @@ def laser(
     calibration: CalibrationOption = None,
     margin_mm: Annotated[
         float | None,
-        typer.Option("--margin-mm", min=0.0, help="How far the flat sheet goes on beyond the squares; 3 squares."),
+        typer.Option(
+            "--margin-mm", metavar="MM", min=0.0, help="How far the flat sheet goes on beyond the squares; 3 squares."
+        ),
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Only hold the calibration against the pictures; exit 1 if it is off.")
@@ -227,7 +229,7 @@ def _run(
     """Collect, solve, say, write, draw."""
     from scanmap.calibration.keeping import parts_lost, refuse_file, refuse_folder, refuse_path
     from scanmap.cli.collecting import SHOWN_REJECTED
-    from scanmap.cli.terminal import say
+    from scanmap.cli.terminal import say, say_written
     from scanmap.session import board_report
     from scanmap.session import calibrating as session
 
@@ -256,9 +258,3 @@ def _run(
     following = {"camera": "laser", "laser": "axis"}.get(part)
     if following is not None:
         say(f"next: scanmap calibrate {following} SOURCE --board {what[1]} --out {out}")
-
-
-def say_written(out: Path, kept: Path | None) -> None:
-    from scanmap.cli.terminal import say
-
-    say(f"wrote {out}" + (f"; the old one is {kept}" if kept is not None else ""))

@@ -23,17 +23,21 @@ def design(
     set_: SetOption = None,
     calibration: CalibrationOption = None,
     baseline_mm: Annotated[
-        float | None, typer.Option("--baseline-mm", min=1.0, max=5000.0, help="Camera to laser [mm].")
+        float | None, typer.Option("--baseline-mm", metavar="MM", min=1.0, max=5000.0, help="Camera to laser [mm].")
     ] = None,
     beta_deg: Annotated[
-        float | None, typer.Option("--beta-deg", min=-79.0, max=79.0, help="Camera turned in toward the laser [deg].")
+        float | None,
+        typer.Option("--beta-deg", metavar="DEG", min=-79.0, max=79.0, help="Camera turned in toward the laser [deg]."),
     ] = None,
     alpha_deg: Annotated[
-        float | None, typer.Option("--alpha-deg", min=2.0, max=84.0, help="Half the horizontal view of the lens [deg].")
+        float | None,
+        typer.Option(
+            "--alpha-deg", metavar="DEG", min=2.0, max=84.0, help="Half the horizontal view of the lens [deg]."
+        ),
     ] = None,
     image: Annotated[str | None, typer.Option("--image", metavar="WxH", help="Resolution, such as 1920x1080.")] = None,
     sigma_px: Annotated[
-        float, typer.Option("--sigma-px", min=0.001, max=20.0, help="How well a column is found [px].")
+        float, typer.Option("--sigma-px", metavar="PX", min=0.001, max=20.0, help="How well a column is found [px].")
     ] = 0.1,
     wall: Annotated[
         str, typer.Option("--wall", metavar="WxH@D", help="Wall whose points are counted: width, height, distance [m].")

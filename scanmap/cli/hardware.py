@@ -63,16 +63,26 @@ def init(
         int, typer.Option("--microsteps", metavar="N", min=1, max=256, help="As the driver's jumpers are set.")
     ] = 16,
     gear: Annotated[
-        float, typer.Option("--gear", metavar="RATIO", help="Turns of the motor for one turn of the head.")
+        float,
+        typer.Option(
+            "--gear", metavar="RATIO", min=0.001, max=10000.0, help="Turns of the motor for one turn of the head."
+        ),
     ] = 1.0,
     baseline_m: Annotated[
-        float, typer.Option("--baseline-m", metavar="METRES", help="From the laser to the lens [m].")
+        float,
+        typer.Option("--baseline-m", metavar="METRES", min=0.001, max=5.0, help="From the laser to the lens [m]."),
     ] = 0.08,
     beta_deg: Annotated[
-        float, typer.Option("--beta-deg", metavar="DEG", help="By how much the camera is turned inward [deg].")
+        float,
+        typer.Option(
+            "--beta-deg", metavar="DEG", min=-79.0, max=79.0, help="By how much the camera is turned inward [deg]."
+        ),
     ] = 25.7,
     alpha_deg: Annotated[
-        float, typer.Option("--alpha-deg", metavar="DEG", help="Half the camera's horizontal field of view [deg].")
+        float,
+        typer.Option(
+            "--alpha-deg", metavar="DEG", min=2.0, max=84.0, help="Half the camera's horizontal field of view [deg]."
+        ),
     ] = 32.3,
     laser: Annotated[
         Literal["grbl", "always-on"],
@@ -95,7 +105,7 @@ def init(
 @stage.command(context_settings={"ignore_unknown_options": True})  # -5 is an angle, not an option
 def jog(
     by_deg: Annotated[
-        float | None, typer.Argument(metavar="[DEG]", help="Turn by so much; negative is clockwise [deg].")
+        float | None, typer.Argument(metavar="DEG", help="Turn by so much; negative is clockwise [deg].")
     ] = None,
     to: Annotated[float | None, typer.Option("--to", metavar="DEG", help="Turn to this bearing instead [deg].")] = None,
     config: ConfigOption = None,

@@ -30,7 +30,11 @@ def self_(
     calibration: CalibrationOption = None,
     scale: Annotated[
         Literal["auto", "baseline", "axis"],
-        typer.Option("--scale", help="The length that is known and holds the scale; auto takes the longer one."),
+        typer.Option(
+            "--scale",
+            metavar="auto|baseline|axis",
+            help="The length that is known and holds the scale; auto takes the longer one.",
+        ),
     ] = "auto",
     out: Annotated[
         Path, typer.Option("--out", metavar="F.toml", help="The new calibration; an old one is kept beside.")
@@ -48,7 +52,7 @@ def self_(
     """
     from scanmap.calibration.keeping import refuse_file, refuse_path
     from scanmap.cli.report import rounds_bar
-    from scanmap.cli.terminal import say
+    from scanmap.cli.terminal import say, say_written
     from scanmap.session.judging import write_refined
     from scanmap.solvers.self_calibration import refine
 
@@ -72,7 +76,7 @@ def self_(
         write_walls(rrd, [in_space(name, head, refined.segments, refined.patches) for name, head in heads])
         say(f"wrote {rrd}")
     kept = write_refined(refined, out, recording, is_twin=is_twin)
-    say(f"wrote {out}" + (f"; the one that was there is {kept}" if kept else ""))
+    say_written(out, kept)
     files = f"{shlex.quote(str(recording))}{_again(config, set_)} --calibration {shlex.quote(str(out))}"
     say(f"next: scanmap calibrate check {files}")
     say(f"next: scanmap replay {files} --out room.ply")
@@ -87,7 +91,8 @@ def check(
         bool, typer.Option("--not-square", help="The room's corners are not square; do not judge by them.")
     ] = False,
     wall_mm_per_m: Annotated[
-        float, typer.Option("--wall-mm-per-m", min=0.0, max=20.0, help="How flat the walls themselves are.")
+        float,
+        typer.Option("--wall-mm-per-m", metavar="MM", min=0.0, max=20.0, help="How flat the walls themselves are."),
     ] = 0.5,
     figure: Figure = None,
     rrd: Rrd = None,

@@ -21,7 +21,7 @@ NAMES = {"ratio": "Algorithm 1", "pixel_angle": "Algorithm 2", "plane": "calibra
 
 def live(
     source: Annotated[
-        Path | None, typer.Argument(metavar="[SOURCE]", help="A recording to play as if live, instead of the rig.")
+        Path | None, typer.Argument(metavar="SOURCE", help="A recording to play as if live, instead of the rig.")
     ] = None,
     row: Annotated[
         int | None, typer.Option("--row", metavar="N", min=0, help="Image row whose distance is shown; the middle one.")

@@ -18,7 +18,7 @@ def view(
     source: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[SOURCE]", help="A recording (.mcap), a folder with scan.csv, a video, .rrd, cloud or mesh."
+            metavar="SOURCE", help="A recording (.mcap), a folder with scan.csv, a video, .rrd, cloud or mesh."
         ),
     ] = None,
     config: ConfigOption = None,

@@ -27,13 +27,17 @@ def table(
         ),
     ],
     width: Annotated[
-        int | None, typer.Option("--width", min=8, max=20000, help="Image along the axis the line moves on [px]; 1600.")
+        int | None,
+        typer.Option(
+            "--width", metavar="PX", min=8, max=20000, help="Image along the axis the line moves on [px]; 1600."
+        ),
     ] = None,
     height: Annotated[
-        int | None, typer.Option("--height", min=8, max=20000, help="Image across that axis [px]; 1200.")
+        int | None, typer.Option("--height", metavar="PX", min=8, max=20000, help="Image across that axis [px]; 1200.")
     ] = None,
     baseline_mm: Annotated[
-        float | None, typer.Option("--baseline-mm", min=1.0, max=5000.0, help="Camera to laser, by ruler [mm]; 80.")
+        float | None,
+        typer.Option("--baseline-mm", metavar="MM", min=1.0, max=5000.0, help="Camera to laser, by ruler [mm]; 80."),
     ] = None,
     rows: Annotated[
         str | None, typer.Option("--rows", metavar="1:3|1,2,6", help="Fit these rows only; the others are predicted.")
@@ -210,7 +214,7 @@ def _write(fit: TableFit, height: int, base: object, out: Path, pairs: Pairs, ch
 
     from scanmap.calibration import Calibration
     from scanmap.calibration.keeping import save_beside
-    from scanmap.cli.terminal import say
+    from scanmap.cli.terminal import say, say_written
     from scanmap.solvers.table import calibration_of
     from scanmap.solvers.table_words import check_worth, worst_percent
 
@@ -220,7 +224,7 @@ def _write(fit: TableFit, height: int, base: object, out: Path, pairs: Pairs, ch
     meta = {**head.meta, "table_rows": len(chosen), "table_date": date.today().isoformat(),
             "table_command": "calibrate table"}  # fmt: skip
     kept = save_beside(replace(head, residuals=residuals, meta=meta), out)
-    say(f"wrote {out}" + (f"; the one that was there is {kept}" if kept else ""))
+    say_written(out, kept)
     if fit.mirrored:
         say("no [ratio] and [pixel_angle] in it: the thesis's models want near returns on the right")
     say(f"next: scanmap scan --calibration {shlex.quote(str(out))} --out room.ply")

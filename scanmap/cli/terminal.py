@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
@@ -79,6 +80,11 @@ def printable(text: str, encoding: str | None) -> str:
 def say(text: str) -> None:
     """One line to the user, taken as it is; broken at words where a person reads it, never in a pipe."""
     console.print(text, markup=False, soft_wrap=not console.is_terminal)
+
+
+def say_written(out: Path, kept: Path | None) -> None:
+    """That a calibration is written, and where the one is now that stood there."""
+    say(f"wrote {out}" + (f"; the old one is {kept}" if kept is not None else ""))
 
 
 def complain(text: str) -> None:

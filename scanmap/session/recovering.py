@@ -7,6 +7,7 @@ from pathlib import Path
 
 from scanmap import recording
 from scanmap.errors import ConfigError
+from scanmap.scan.formats import check_writable
 
 
 def recover(path: Path, out: Path | None = None) -> list[str]:
@@ -17,10 +18,14 @@ def recover(path: Path, out: Path | None = None) -> list[str]:
         RecordingError: nothing is wrong with it, nothing can be saved, or the new file cannot be written.
     """
     if path.suffix != ".mcap" or not path.is_file():
-        raise ConfigError(f"{path}: not a recording; scanmap recover wants the .mcap file of a scan")
+        what = "not a recording" if path.exists() else "there is no such file"
+        raise ConfigError(f"{path}: {what}; scanmap recover wants the .mcap file of a scan")
     out = out or path.with_name(f"{path.stem}.whole.mcap")
     if out.suffix != ".mcap" or recording.is_later_part(out):
         raise ConfigError(f"--out {out}: must end in .mcap, and not in .part2.mcap; try {path.stem}.whole.mcap")
+    if out.exists():
+        raise ConfigError(f"recording {out} exists and is not overwritten; give another --out or move it")
+    check_writable(out, suffixes=(".mcap",))
     saved = recording.recover(path, out)
     source = recording.open_source(path)
     readable = sum(1 for _ in source.shots())

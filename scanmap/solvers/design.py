@@ -155,4 +155,6 @@ def _model_error(head: Calibration, column: Array, row: float, distance: Array) 
         near = (exact[:, 0] > 0.3) & (exact[:, 0] < 3.0) & np.isfinite(depth)
         if near.any():
             words.append(f"{model} {100.0 * np.abs(depth[near] / exact[near, 0] - 1.0).max():.1f} %")
+    if not words:
+        return "nothing in view from 0.3 to 3 m to compare the thesis's models by"
     return "worst error against the plane model from 0.3 to 3 m: " + ", ".join(words)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.errors import CalibrationError, CameraError, RecordingError
+from scanmap.errors import CalibrationError, CameraError, ConfigError, RecordingError
 from scanmap.recording import open_source
 from scanmap.recording.frames import SUFFIXES
 from scanmap.recording.video import VIDEO_SUFFIXES
@@ -92,10 +92,11 @@ def read_pictures(path: Path) -> Iterator[Picture | Rejected]:
     """The pictures of a folder, a video or a recording, in order; bearings where it has them.
 
     Raises:
-        RecordingError: there is nothing to read.
+        ConfigError: there is no such folder or file.
+        RecordingError: there is nothing to read in it.
     """
     if not path.exists():
-        raise RecordingError(
+        raise ConfigError(
             f"{path} does not exist; SOURCE is a folder of pictures, a video, a recording (.mcap), or `camera`"
         )
     if path.is_dir() and not (path / "scan.csv").exists() and not any(path.glob("*.mcap")):

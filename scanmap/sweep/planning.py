@@ -110,7 +110,7 @@ class Plan(NamedTuple):
         return {
             "shots": str(len(self.bearings)),
             "estimated_s": f"{self.time_s:.1f}",
-            **{key: str(value) for key, value in self.params.model_dump().items()},
+            **{key: str(value) for key, value in self.params.model_dump(mode="json").items()},
         }
 
 
