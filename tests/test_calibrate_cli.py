@@ -32,7 +32,7 @@ def test_board_writes_a_sheet_and_says_what_comes_next(run: Run) -> None:
         (["board", "--out", "board.svg"], 2, "board.pdf"),
         (["board", "--out", "b.pdf", "--board", "chessboard:8x6"], 2, "chessboard:8x6:40mm"),
         (["board", "--out", "b.pdf", "--paper", "b9"], 2, "a4, a3, letter"),
-        (["calibrate", "camera", "nowhere", "--board", BOARD], 1, "does not exist"),
+        (["calibrate", "camera", "nowhere", "--board", BOARD], 2, "does not exist"),
         (["calibrate", "camera", ".", "--board", BOARD], 1, "no pictures"),
         (["calibrate", "camera", ".", "--board", "checkers"], 2, "not the name of a board"),
         (["calibrate", "camera", ".", "--board", BOARD, "--out", "c.txt"], 2, "c.toml"),

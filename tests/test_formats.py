@@ -250,6 +250,17 @@ def test_meshes_are_read_by_trimesh(scan, tmp_path, name):
         assert len(built.vertices) == len(np.unique(own.triangles))
 
 
+def test_facets_of_an_stl_have_the_normal_of_their_corners(scan, tmp_path):
+    write(scan, tmp_path / "room.stl")
+    data = (tmp_path / "room.stl").read_bytes()
+    facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("free", "<u2")], offset=84)
+    a, b, c = np.moveaxis(facets["corners"].astype(np.float64), 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    assert len(facets) == struct.unpack_from("<I", data, 80)[0] > 500
+    np.testing.assert_allclose((facets["normal"] * normal).sum(axis=1), 1.0, atol=1e-3)
+
+
 def test_mesh_says_where_it_comes_from(scan, tmp_path):
     for name in ("room.glb", "room.stl", "room.obj", "room.mesh.ply"):
         write(scan, tmp_path / name)

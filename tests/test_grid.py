@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from analytic_scan import box_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from rooms_by_rays import scan_room
 
 from scanmap.geometry import HeadMount, rotation_x, rotation_y
-from scanmap.grid import GridParams, OccupancyGrid
+from scanmap.grid import GridParams, OccupancyGrid, find_floor
+from scanmap.grid.evidence import polar_evidence
 from scanmap.laserline import Reason
 from scanmap.scan import Scan
 
@@ -237,6 +239,28 @@ def test_a_single_stray_row_is_no_obstacle():
     scan.points[1, 150] *= 0.5
     grid = OccupancyGrid.from_scan(scan)
     assert not (places(grid, grid.occupied)[:, 0] < 3.0).any()
+
+
+def test_free_space_begins_where_the_view_covers_its_share_of_the_band():
+    """From 1 m above the floor the band of 0.1 to 1.8 m spans atan(0.9 / r) + atan(0.8 / r), of which 60 % must be seen.
+
+    A camera's rows are even in the tangent of their elevation, not in the elevation that counts.
+    """
+    scan = box_scan(np.array([0.0]), 480, room=((-1.0, -1.0, -1.0), (3.1, 1.0, 1.6)))
+    found = polar_evidence(scan, find_floor(scan), GridParams())
+    above, below = np.abs(np.arctan2(scan.points[0, [0, -1], 2], scan.points[0, [0, -1], 0]))
+    r = np.arange(0.05, 2.0, 0.001)
+    up, down = np.arctan(0.8 / r), np.arctan(0.9 / r)
+    first = r[np.argmax(np.minimum(up, above) + np.minimum(down, below) >= 0.6 * (up + down))]
+    assert found.free_from[0] == pytest.approx(first, abs=1.5 * CELL / 3)
+
+
+def test_a_low_thing_before_a_wall_far_off_is_an_obstacle_of_its_own():
+    """At 5 m the wall's rows scatter by sigma = 0.1 m; a box 0.2 m before it is seen by a third as many rows."""
+    room = ((-1.0, -1.0, 0.0), (5.0, 1.0, 2.6))
+    box = ((4.75, -0.5, 0.0), (5.0, 0.5, 0.55))
+    grid = grid_of(np.arange(-4, 5, 1.0), room=room, boxes=[box], rows=600, noise=1e-3, rng=np.random.default_rng(2))
+    assert at(grid, 4.76, 0.0) == 100
 
 
 def test_empty_and_hopeless_scans_give_an_unknown_grid():

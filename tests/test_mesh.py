@@ -103,3 +103,30 @@ def test_vertices_are_the_points_in_their_order_and_holes_stay_holes():
     touched = (4 + 1) * (5 + 1)
     assert len(built.triangles) == 2 * (len(QUARTER) - 1) * (ROWS - 1) - 2 * touched + 4
     border(built.triangles)
+
+
+def test_bearings_far_apart_are_no_neighbours_whatever_lies_between():
+    assert len(mesh(box_scan(np.array([0.0, 14.0]), ROWS)).triangles) == 2 * (ROWS - 1)
+    assert len(mesh(box_scan(np.array([0.0, 16.0]), ROWS)).triangles) == 0
+
+
+@pytest.mark.parametrize("step", [1.0, 3.0, 6.0])
+def test_cells_across_the_edge_of_two_walls_are_split_along_it(step):
+    """Of a cell's two ways to be split, the one whose triangles hang less before floor, walls and ceiling."""
+    scan = box_scan(np.arange(0.0, 91.0, step), ROWS)
+    assert scan.valid.all()
+    edges = {frozenset(edge) for edge in directed_edges(mesh(scan).triangles)}
+    number = np.arange(scan.valid.size).reshape(scan.valid.shape)
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]))
+    points = scan.points.reshape(-1, 3).astype(np.float64)
+
+    def hanging(*triangles):
+        low, high = np.array(ROOM)
+        middles = (points[list(corners)].mean(axis=0) for corners in triangles)
+        return sum(np.minimum(middle - low, high - middle).min(axis=1) for middle in middles)
+
+    rising, falling = hanging((a, b, d), (a, d, c)), hanging((a, b, c), (b, d, c))
+    taken = np.where([frozenset(pair) in edges for pair in zip(a, d, strict=True)], rising, falling)
+    crossed = np.abs(rising - falling) > 1e-4
+    assert crossed.sum() > 20
+    assert taken[crossed].sum() < 1.05 * np.minimum(rising, falling)[crossed].sum()

@@ -165,6 +165,10 @@ def test_others_readers_read_every_message(tmp_path: Path) -> None:
     info = seen["/camera/camera_info"][0]
     assert (info.width, info.height) == (64, 48)
     assert np.array_equal(info.k.reshape(3, 3), CALIBRATION.intrinsics.matrix)
+    # Pictures are as the lens made them; P is what a rectified one would have: the same camera, no second eye.
+    assert np.array_equal(info.p.reshape(3, 4), np.hstack([CALIBRATION.intrinsics.matrix, np.zeros((3, 1))]))
+    assert np.array_equal(info.r.reshape(3, 3), np.eye(3))
+    assert (info.distortion_model, info.d.tolist()) == ("plumb_bob", list(CALIBRATION.intrinsics.distortion))
 
 
 def test_the_mcap_library_finds_every_crc_right_and_all_that_came_along(tmp_path: Path) -> None:

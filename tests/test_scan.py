@@ -147,6 +147,21 @@ def test_where_passes_disagree_the_surer_one_stays_untouched():
         np.testing.assert_allclose(merged.sigma_m, 0.001, rtol=1e-6)
 
 
+def test_what_agrees_is_within_four_deviations_and_at_least_two_millimetres():
+    """Of the difference, whose deviation is sqrt(2) of one's own: 4.2 mm are three of 1 mm, 8 mm are six."""
+    for sigma, apart, agrees in (
+        (1e-3, 4.2e-3, True),
+        (1e-3, 8e-3, False),
+        (1e-5, 1.5e-3, True),
+        (1e-5, 2.1e-3, False),
+    ):
+        first, second = profile(2.0, sigma), profile(2.0 + apart, 1.01 * sigma)
+        merged = scan_of([(0.0, first), (0.0, second)], HeadMount()).merged()
+        middle = abs(merged.points[0, 0, 0] - 2.0 - 0.5 * apart) < 0.1 * apart
+        assert middle == agrees, (sigma, apart)
+        assert np.allclose(merged.sigma_m, sigma / np.sqrt(2.0), rtol=0.02) == agrees
+
+
 def test_a_row_that_one_pass_missed_is_taken_from_the_other():
     lost = profile(2.0, reason=[Reason.WEAK] * 3 + [Reason.OK] * 2 + [Reason.WIDE])
     found = profile(2.0, reason=[Reason.OK] * 5 + [Reason.WEAK])

@@ -24,9 +24,9 @@ class Mesh(NamedTuple):
 def mesh(scan: Scan, params: ScanParams | None = None) -> Mesh:
     """The points of a scan whose bearings ascend (`Scan.merged`), and triangles between those of one surface.
 
-    A cell of four neighbours gives two triangles, split along the diagonal that bridges the smaller step in depth,
-    one where three of them hold together, none across a depth edge. All are counter-clockwise as the head sees them;
-    a scan of a full turn closes.
+    A cell of four neighbours gives two triangles, split along the farther diagonal: most edges of a room are hollow, and
+    a triangle across one would hang before it. Where three of them hold together it gives one, none across a depth
+    edge. All are counter-clockwise as the head sees them; a scan of a full turn closes.
     """
     params = params or ScanParams()
     if len(scan) < 2 or scan.rows < 2:
@@ -59,10 +59,10 @@ def _cell_triangles(q: F32, rows: Mask, bearings: Mask, number: NDArray[np.int32
     left, right, top, bottom = rows[1:], rows[:-1], bearings[:, :-1], bearings[:, 1:]  # as the head sees a cell
     corners = {"tr": top & right, "tl": top & left, "br": bottom & right, "bl": bottom & left}
     with np.errstate(invalid="ignore"):
-        shorter = np.abs(q[:-1, :-1] - q[1:, 1:]) <= np.abs(q[1:, :-1] - q[:-1, 1:])
+        farther = q[:-1, :-1] + q[1:, 1:] <= q[1:, :-1] + q[:-1, 1:]
     falling = corners["tr"].astype(np.int8) + corners["bl"]  # triangles if split from top left to bottom right
     rising = corners["tl"].astype(np.int8) + corners["br"]
-    rises = (rising > falling) | ((rising == falling) & shorter)
+    rises = (rising > falling) | ((rising == falling) & farther)
     place = {"tr": number[:-1, :-1], "tl": number[1:, :-1], "br": number[:-1, 1:], "bl": number[1:, 1:]}
     found = []
     for corner, three, split in (
