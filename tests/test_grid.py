@@ -242,7 +242,7 @@ def test_a_single_stray_row_is_no_obstacle():
 
 
 def test_free_space_begins_where_the_view_covers_its_share_of_the_band():
-    """From 1 m above the floor the band of 0.1 to 1.8 m spans atan(0.9 / r) + atan(0.8 / r), of which 60 % must be seen.
+    """From 1 m up, the band of 0.1 to 1.8 m spans atan(0.9 / r) + atan(0.8 / r), of which 60 % must be seen.
 
     A camera's rows are even in the tangent of their elevation, not in the elevation that counts.
     """

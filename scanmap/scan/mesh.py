@@ -24,9 +24,9 @@ class Mesh(NamedTuple):
 def mesh(scan: Scan, params: ScanParams | None = None) -> Mesh:
     """The points of a scan whose bearings ascend (`Scan.merged`), and triangles between those of one surface.
 
-    A cell of four neighbours gives two triangles, split along the farther diagonal: most edges of a room are hollow, and
-    a triangle across one would hang before it. Where three of them hold together it gives one, none across a depth
-    edge. All are counter-clockwise as the head sees them; a scan of a full turn closes.
+    A cell of four neighbours gives two triangles, split along the farther diagonal: most edges of a room are hollow,
+    and a triangle across one would hang before it. Where three of them hold together it gives one, none across a
+    depth edge. All are counter-clockwise as the head sees them; a scan of a full turn closes.
     """
     params = params or ScanParams()
     if len(scan) < 2 or scan.rows < 2:
