@@ -13,7 +13,7 @@ def with_and_without(image, monkeypatch):
     """Lines with the quick look and with the whole search alone."""
     quick = find_laser_line(image, PARAMS)
     with monkeypatch.context() as patched:
-        patched.setattr(search, "settled", lambda leads, noise, min_snr: np.zeros(len(leads.column), bool))
+        patched.setattr(search, "settled", lambda leads, noise, min_snr: np.zeros(leads.column.shape, bool))
         return quick, find_laser_line(image, PARAMS)
 
 

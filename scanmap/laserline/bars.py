@@ -7,6 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.params import LaserLineParams
+from scanmap.laserline.pictures import by_picture
+from scanmap.laserline.result import LaserLine, Reason
+from scanmap.laserline.sight import Sight
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -32,6 +38,19 @@ class Bars(NamedTuple):
     height: F64  # over the brighter of its two sides [grey levels]
 
 
+def take_bars(line: LaserLine, sight: Sight, params: LaserLineParams) -> None:
+    """Rows that no profile was found in, but a saturated bar with a beam's edges."""
+    if params.method != "gauss":
+        return
+    lost = np.flatnonzero(line.reason != Reason.OK)
+    lit = None if sight.off is None else sight.lit
+    for noise, own in zip(sight.noise, by_picture(lost // sight.height, len(sight.noise)), strict=True):
+        bars = find_bars(sight.plane, lost[own], SATURATED, noise, lit)
+        r = bars.row
+        line.column_px[r], line.sigma_px[r] = bars.column, bars.sigma_px
+        line.width_px[r], line.peak[r], line.reason[r] = bars.width_px, bars.height, Reason.OK
+
+
 def find_bars(plane: U8, rows: Index, saturated: int, noise: float, lit: U8 | None = None) -> Bars:
     """The bars in `rows` (N,) of a plane (H, W); rows without one are left out.
 
@@ -42,7 +61,9 @@ def find_bars(plane: U8, rows: Index, saturated: int, noise: float, lit: U8 | No
     taken at four levels, each crossing interpolated between two samples. A beam's edge is as soft as the beam is
     wide; a window's is as sharp as the lens, and a lamp's glow is softer: neither is taken.
     """
-    row, middle = _plateaus(plane, rows, saturated)
+    row = middle = rows[:0]
+    if len(rows) >= _FEW_ROWS:
+        row, middle = _plateaus(plane, rows, saturated)
     if len(row) < _FEW_ROWS:
         return Bars(row[:0], *(np.empty(0) for _ in range(4)))
     x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, plane.shape[1] - 1)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.peaks import Peaks, fit_gaussian
+from scanmap.laserline.pictures import not_one
 from scanmap.laserline.samples import Samples
 
 Index = NDArray[np.intp]
@@ -18,7 +19,7 @@ _AS_WIDE, _FLAT_MISFIT, _BAR_PX = 0.9, 0.055, 5.0
 
 
 def by_brightness(
-    peaks: Peaks, good: NDArray[np.bool_], around: Samples, half: int, some: Index | slice, noise: float
+    peaks: Peaks, good: NDArray[np.bool_], around: Samples, half: int, some: Index | slice
 ) -> tuple[Peaks, NDArray[np.bool_]]:
     """The peaks, those with a saturated core placed by brightness, where colour was compressed.
 
@@ -26,11 +27,12 @@ def by_brightness(
     does not fit there is smeared colour, not a halo, for a halo is dimmer in the other channels.
     """
     even = np.zeros(len(good), bool)
-    again = np.flatnonzero(peaks.clipped & good & (peaks.width_px < _BAR_PX))
+    smeared = around.smeared[some]
+    again = not_one(np.flatnonzero(peaks.clipped & good & smeared & (peaks.width_px < _BAR_PX)))
     if around.beside is None or not again.size:
         return peaks, even
     rows = again if isinstance(some, slice) else some[again]
-    found = fit_gaussian(*around.brightness_of(half, rows), noise, peaks.contrast)
+    found = fit_gaussian(*around.brightness_of(half, rows), around.rows.of(rows), peaks.contrast)
     agrees = np.abs(found.offset_px - peaks.offset_px[again]) < _SAME_PX
     agrees &= (found.sigma_px < _NO_WORSE * peaks.sigma_px[again]) & ~found.one_sided
     even[again] = agrees & (found.width_px > _AS_WIDE * peaks.width_px[again])

@@ -142,14 +142,15 @@ def _of_laser(seen: _Colours, laser: float | None, noise: float) -> F32:
     return np.asarray(np.where(seen.saturated, np.maximum(factor, pure), factor), np.float32)
 
 
-def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) -> Mask:
-    """Rows (H,) in runs that stand out in another channel nearly as much as in the laser's own.
+def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, rows: int) -> Mask:
+    """Rows (P H,) in runs that stand out in another channel nearly as much as in the laser's own.
 
     Args:
-        column: (H,) of the line, NaN where none.
-        image: (H, W, 3).
+        column: (P H,) of the lines of P pictures below each other, NaN where none.
+        image: (P H, W, 3).
         channel: the laser's own.
-        pure: (H,) rows known to be of its colour; a run of mostly such is not asked.
+        pure: (P H,) rows known to be of its colour; a run of mostly such is not asked.
+        rows: of a picture, H.
 
     Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
     parts are asked. Where the core saturates they say nothing, but what is beside it must not be white.
@@ -158,7 +159,7 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask) 
     row = np.flatnonzero(np.isfinite(column))
     if not row.size or image.shape[1] <= 2 * HALF:
         return lost
-    run = numbered(row, column[row], 1)
+    run = numbered(row, column[row], 1, rows)
     doubtful = (np.bincount(run, pure[row]) < _MOSTLY * np.bincount(run))[run]
     if not doubtful.any():
         return lost

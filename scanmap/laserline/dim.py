@@ -9,6 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from scanmap.laserline.pictures import Rows
+
 F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 
@@ -32,7 +34,7 @@ class DimRows(NamedTuple):
     height: F32  # A, drawn towards what it is nearby by how little the row knows of it
 
 
-def dim_rows(y: F32, x: F32, cut: Index, s: F32, A: F32, noise: float) -> DimRows | None:
+def dim_rows(y: F32, x: F32, cut: Index, s: F32, A: F32, rows: Rows) -> DimRows | None:
     """The rows of (N,) fits in which noise hides how wide the line is, fitted again; None where there are none.
 
     Args:
@@ -41,23 +43,35 @@ def dim_rows(y: F32, x: F32, cut: Index, s: F32, A: F32, noise: float) -> DimRow
         cut: (M,) rows that lack samples, which are left as they are.
         s: (N,) widths of the rows' own fits [px].
         A: (N,) their heights [grey levels].
-        noise: standard deviation of a sample [grey levels].
+        rows: which pictures they are of.
 
     Width and height are alike in neighbouring rows of one surface, and what a row says of its place depends on neither.
     With the width given, the place is where the matched filter answers most (the maximum of the likelihood), not the
     next bump of noise; and neither sigma nor the decision which rows to believe follows the row's own noise.
     """
-    limit = np.float32(noise * np.sqrt(2.0 / _ROOT_PI) / _DIM)
-    if np.count_nonzero(A * np.sqrt(s) < limit) < _NEARBY:
+    limit = (rows.noise_of * (np.sqrt(2.0 / _ROOT_PI) / _DIM)).astype(np.float32)
+    light = A * np.sqrt(s)
+    if np.count_nonzero(light < limit.max()) < _NEARBY:
         return None
+    lacking = np.zeros(len(s), bool)
+    lacking[cut] = True
+    found = []
+    for part, least, noise in zip(rows.parts, limit, rows.noise_of, strict=True):
+        if np.count_nonzero(light[part] < least) >= _NEARBY:
+            lines = _dim_rows(y[:, part], x, lacking[part], s[part], A[part], least, float(noise))
+            found.append(lines._replace(rows=lines.rows + part.start))
+    return DimRows(*(np.concatenate(values) for values in zip(*found, strict=True))) if found else None
+
+
+def _dim_rows(y: F32, x: F32, lacking: NDArray[np.bool_], s: F32, A: F32, limit: np.float32, noise: float) -> DimRows:
+    """The same of one picture."""
     # Told from the neighbours too: choosing rows by their own noise would bias them.
     width, height = _middle(s), _middle(A)
     dim = height * np.sqrt(width) < limit
-    dim[cut] = False
-    rows = np.flatnonzero(dim)
+    rows = np.flatnonzero(dim & ~lacking)
     if len(rows) < _NEARBY:
-        return None
-    y, near = y[:, rows], width[rows]
+        return DimRows(rows[:0], *(A[:0] for _ in range(5)))
+    y, near = y.take(rows, axis=1), width[rows]
     u, A_own, b = _placed(y, x, near, float(np.median(near)))
     residual = y - b - A_own * _bell(x, u, near)
     plain = np.square(residual).mean(axis=0) < _TEXTURE * noise**2

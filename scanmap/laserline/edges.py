@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.path import strips
 from scanmap.laserline.peaks import Peaks, fit_gaussian
+from scanmap.laserline.pictures import Rows, not_one
 from scanmap.laserline.samples import Samples, ends
 from scanmap.laserline.sight import Sight
 
@@ -54,18 +55,24 @@ def no_edges(rows: int) -> Edges:
     return Edges(np.zeros(rows, np.float32), np.zeros(rows, np.float32))
 
 
-def sides_of(y: F32, noise: float) -> Sides:
+def sides_of(y: F32, rows: Rows) -> Sides:
     """Levels at the two ends of windows (n, N)."""
-    k = max(2, len(y) // 6)
-    left, right = (cv2.blur(v[None], (_ROWS, 1), borderType=cv2.BORDER_REPLICATE)[0] for v in ends(y))
-    step = right - left
-    # Compression leaves noise that means do not take out: what they still scatter by, some rows apart.
-    scatter = float(np.median(np.abs(step[_APART:] - step[:-_APART]))) / 0.954 if len(step) > 2 * _APART else 0.0
-    return Sides(left, right, np.abs(step) > _SURE * max(noise * np.sqrt(2.0 / (k * _ROWS)), scatter))
+    level = np.float32(np.sqrt(2.0 / (max(2, len(y) // 6) * _ROWS)))
+    both, scatter = np.stack(ends(y)), rows.noise_of.astype(np.float32) * level
+    for k, part in enumerate(rows.parts):
+        if part.stop > part.start:
+            both[:, part] = cv2.blur(both[:, part], (_ROWS, 1), borderType=cv2.BORDER_REPLICATE)
+        if part.stop - part.start > 2 * _APART:
+            # Compression leaves noise that means do not take out: what they still scatter by, some rows apart.
+            step = both[1, part] - both[0, part]
+            apart = np.abs(step[_APART:] - step[:-_APART])
+            apart.partition(len(apart) // 2)
+            scatter[k] = max(scatter[k], apart[len(apart) // 2] / np.float32(0.954))
+    return Sides(both[0], both[1], np.abs(both[1] - both[0]) > (np.float32(_SURE) * scatter)[rows.picture])
 
 
 def across_edges(
-    peaks: Peaks, good: NDArray[np.bool_], sides: Sides, around: Samples, half: int, some: Index | slice, noise: float
+    peaks: Peaks, good: NDArray[np.bool_], sides: Sides, around: Samples, half: int, some: Index | slice
 ) -> Edges:
     """What steps of the room's brightness under the lines do to them.
 
@@ -83,8 +90,9 @@ def across_edges(
     if not at.size:
         return edges
     y, usable = around.of(half, at if isinstance(some, slice) else some[at])
-    whole = usable.all(axis=0)
-    y, at = np.ascontiguousarray(y[:, whole]), at[whole]
+    whole = not_one(np.flatnonzero(usable.all(axis=0)))
+    y, at = y.take(whole, axis=1), at[whole]
+    noise = around.rows.of(some).noise[at]
     left, right = (np.maximum(side[at], np.float32(_LEAST)) for side in (sides.left, sides.right))
     right = np.minimum(np.maximum(right, left / np.float32(_RATIO)), left * np.float32(_RATIO))
     shift, spread = _explained(_evened(y, left, right), peaks.offset_px[at], peaks.width_px[at], noise)
@@ -118,17 +126,18 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     room = np.asarray(cv2.filter2D(np.asarray(room), -1, smooth, borderType=cv2.BORDER_REPLICATE), np.float32)
     low, high = room.min(axis=0), room.max(axis=0)
     contrast = (high - low) / np.maximum(high + low, np.float32(2.0 * _LEAST))
-    uneven = high - low > np.float32(_UNEVEN * sight.noise)
+    uneven = high - low > np.float32(_UNEVEN * sight.noise[0])
     uneven &= _MOVES * contrast * peaks.width_px[good] > _WORTH * peaks.sigma_px[good]
     some = np.flatnonzero(uneven)
     if not some.size:
         return edges
-    lit, dark = _strips(sight.on, rows[some], columns[some], half), room[:, some]
+    lit, dark = _strips(sight.on, rows[some], columns[some], half), room.take(some, axis=1)
     even = _added(lit, dark)
     which = np.flatnonzero(good)[some]
-    tells = usable[:, which] * (np.maximum(lit, dark) < SATURATED - 3)
+    tells = usable.take(which, axis=1) * (np.maximum(lit, dark) < SATURATED - 3)
     many = np.ascontiguousarray(np.broadcast_to(tells[:, None], even.shape)).reshape(len(even), -1)
-    found = fit_gaussian(even.reshape(len(even), -1), many, sight.noise, peaks.contrast)
+    alone = Rows(np.zeros(many.shape[1], np.intp), sight.noise)
+    found = fit_gaussian(even.reshape(len(even), -1), many, alone, peaks.contrast)
     u = found.offset_px.reshape(even.shape[1:]) - peaks.offset_px[which]
     edges.doubt[which] = np.minimum(np.maximum(u, -_MOVES), _MOVES).std(axis=0)
     return edges
@@ -169,14 +178,14 @@ def _evened(y: F32, left: F32, right: F32) -> F32:
     return np.concatenate([y[:, None] / paint, y[:, None] - shadow, y[:, None]], axis=1)
 
 
-def _explained(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32]:
+def _explained(even: F32, u: F32, width: F32, noise: F32) -> tuple[F32, F32]:
     """How far lines (M,) lie from `u`, by several explanations of their windows, and how far those are from each other.
 
     Args:
         even: (n, K, M) the windows without what each explanation says is not the line.
         u: (M,) where the lines are without any [px from the middle].
         width: (M,) how wide they are, as sigma [px].
-        noise: standard deviation of a sample [grey levels].
+        noise: (M,) standard deviation of a sample [grey levels].
 
     Steps of Gauss and Newton from a common place, weighted by their likelihoods; where they are long, again from there.
     """
@@ -184,18 +193,18 @@ def _explained(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32]:
     shift, spread = np.zeros_like(u), np.zeros_like(u)
     far = np.arange(len(u))
     for _ in range(_STEPS):
-        step, spread[far], wider = _step_from(even[:, :, far], start[far] + shift[far], width[far], noise)
+        step, spread[far], wider = _step_from(even.take(far, axis=2), start[far] + shift[far], width[far], noise[far])
         shift[far] = np.minimum(np.maximum(shift[far] + step, -limit[far]), limit[far])
         long = np.abs(step) > _LONG * width[far]
         width = width.copy()
         width[far] = np.maximum(width[far] * wider, np.float32(0.5))
-        far = far[long]
+        far = not_one(far[long])
         if not far.size:
             break
     return shift, spread
 
 
-def _step_from(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32, F32]:
+def _step_from(even: F32, u: F32, width: F32, noise: F32) -> tuple[F32, F32, F32]:
     """One step (M,) from `u`, the spread of the explanations' places, and the factor by which lines are wider."""
     n = len(even)
     z = ((np.arange(n, dtype=np.float32) - n // 2)[:, None] - u) / width
@@ -204,7 +213,7 @@ def _step_from(even: F32, u: F32, width: F32, noise: float) -> tuple[F32, F32, F
     parts = _orthogonal(profiles)
     level, high, wide, moved = (np.einsum("nm,nkm->km", part, even) for part in parts)
     chi2 = np.einsum("nkm,nkm->km", even, even) - level**2 - high**2 - wide**2 - moved**2
-    chi2 *= np.float32(1.0 / noise**2)
+    chi2 *= np.float32(1.0) / np.square(noise)
     # Lengths of what each profile has of its own turn shares into height, width and place.
     _, per_height, per_width, per_shift = (
         np.einsum("nm,nm->m", part, profile) for part, profile in zip(parts, profiles, strict=True)

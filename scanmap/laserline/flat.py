@@ -22,12 +22,13 @@ _ENOUGH_ROWS = 700
 _SURE = 3.0  # standard errors of its mean that a stretch's flatness must exceed
 
 
-def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
-    """Rows (H,) in stretches whose profile is flat on top, as no unsaturated beam's is.
+def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mask:
+    """Rows (P H,) in stretches whose profile is flat on top, as no unsaturated beam's is.
 
     Args:
-        column, width, peak: (H,) of the line, NaN where none.
-        plane: (H, W) it was found in.
+        column, width, peak: (P H,) of the lines of P pictures below each other, NaN where none.
+        plane: (P H, W) they were found in.
+        height: rows of a picture, H.
 
     One row's samples scatter too much to say so; the mean of a stretch does not. Both sides are asked, and the higher
     background counts for each, so that a line on a step of brightness is not taken for a strip.
@@ -37,11 +38,13 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
         row = np.flatnonzero((width > _WIDE_PX) & (peak < SATURATED))
     if len(row) < _LEAST_ROWS:
         return flat
-    run = numbered(row, column[row], 2)
+    run = numbered(row, column[row], 2, height)
     # Of many rows some tell of all.
-    step = 1 + len(row) // _ENOUGH_ROWS
+    picture = row // height
+    step = (1 + np.bincount(picture) // _ENOUGH_ROWS)[picture]
+    asked = row % height % step == 0
     every, by_run = row, run
-    row, run = row[::step], run[::step]
+    row, run, step = row[asked], run[asked], step[asked]
     at = column[row] + np.array([[0.0], [-_AT], [_AT], [-3.0], [3.0]]) * width[row]
     middle, left, right, below_left, below_right = _sampled(plane, row, at)
     shoulder = np.minimum(left - below_left, right - below_right)
@@ -52,7 +55,7 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
         return flat
     total = np.zeros((5, len(row) + 1))
     np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
-    index, reach = np.arange(len(row)), max(2, _NEARBY // step)
+    index, reach = np.arange(len(row)), np.maximum(2, _NEARBY // step)
     first = np.maximum(index - reach, np.searchsorted(run, run))
     stop = np.minimum(index + reach + 1, np.searchsorted(run, run, side="right"))
     rows = stop - first
@@ -60,7 +63,8 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8) -> Mask:
     scatter = np.sqrt(np.maximum(square - mean * mean, 0.0) / np.maximum(rows - 1, 1))
     sure = (mean > _SURE * scatter) & (top > 0.3 * usual) & (clipped < 0.1) & (rows >= _LEAST_ASKED)
     # A row is what the asked ones of its run before and after it are.
-    for ask in (np.arange(len(every)) // step, np.minimum(np.arange(len(every)) // step + 1, len(row) - 1)):
+    after = np.searchsorted(row, every, side="right")
+    for ask in (np.maximum(after - 1, 0), np.minimum(after, len(row) - 1)):
         flat[every] |= sure[ask] & (run[ask] == by_run)
     return flat
 

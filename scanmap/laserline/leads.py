@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from scanmap.laserline.candidates import runs_in
 from scanmap.laserline.path import JUMP
+from scanmap.laserline.pictures import by_picture
 from scanmap.laserline.shares import heights_of
 
 F64 = NDArray[np.float64]
@@ -29,7 +31,7 @@ STEEP_PX = 12.0  # a line that runs farther from one lead to the next is left to
 
 
 class Leads(NamedTuple):
-    """The best place of each of N rows, arrays (N,)."""
+    """The best place of each of N rows of P pictures, arrays (P, N)."""
 
     column: F32  # [px] to a pixel or two
     height: F32  # over the brighter of its two sides [grey levels]
@@ -37,13 +39,18 @@ class Leads(NamedTuple):
     beside: F32  # where that is [px]
 
 
-def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
+def find_leads(rows: Sequence[U8], limits: tuple[F64, F64]) -> Leads:
     """The best place of each block, and the next best at two resolutions.
 
     Args:
-        rows: (N, W) one row of every other block.
-        limits: first and last column (B,) that a block's line can have, NaN where it can have none.
+        rows: (N, W) one row of every other block of each of P pictures.
+        limits: first and last column (N,) that a block's line can have, NaN where it can have none.
     """
+    # One picture after the other: all of them together would not fit into the processor's cache.
+    return Leads(*(np.stack(values) for values in zip(*(_leads_of_one(r, limits) for r in rows), strict=True)))
+
+
+def _leads_of_one(rows: U8, limits: tuple[F64, F64]) -> Leads:
     sums, scale = _halved(rows), 2
     index = np.arange(len(rows))
     response = _allowed(_stands_out(sums), scale, limits)
@@ -70,47 +77,51 @@ def _highest_elsewhere(response: U16, at: NDArray[np.intp], scale: int) -> tuple
     return highest, (scale * (place + _EDGE) + 0.5 * (scale - 1)).astype(np.float32)
 
 
-def settled(leads: Leads, noise: float, min_snr: float) -> Mask:
-    """Blocks (B,) whose lead no path over the candidates would leave.
+def settled(leads: Leads, noise: F64, min_snr: float) -> Mask:
+    """Blocks (P, N) whose lead no path over the candidates would leave.
 
     A chain of leads that continue each other costs the path nothing, and every block of it gives more than any
     other place there. The path takes it whole unless a rival chain is so near in height that a jump there and
     back would pay.
     """
     # The noise of the largest of two sides and a centre of six samples, as of one row.
-    unit = 1.35 * max(noise, 1.2) / np.sqrt(2.0 * _CENTRE)
+    unit = (1.35 / np.sqrt(2.0 * _CENTRE)) * np.maximum(noise, 1.2)[:, None]
     believed = (leads.height > _LEAST_SNR * unit) & (leads.height > leads.rival)
     ahead = np.log(np.maximum(leads.height, 1e-3) / np.maximum(leads.rival, min_snr * unit))
-    linked = believed[1:] & believed[:-1] & (np.abs(np.diff(leads.column)) <= STEEP_PX)
-    chain = np.concatenate([[0], np.cumsum(~linked)])
+    linked = np.zeros(believed.shape, bool)
+    linked[:, 1:] = believed[:, 1:] & believed[:, :-1] & (np.abs(np.diff(leads.column)) <= STEEP_PX)
+    chain = np.cumsum(~linked) - 1
     long = np.bincount(chain) >= _LEAST_BLOCKS
-    won = np.bincount(chain, ahead) > _SETTLED * JUMP
-    good: Mask = believed & (long & won)[chain]
+    won = np.bincount(chain, ahead.ravel()) > _SETTLED * JUMP
+    good: Mask = believed & (long & won)[chain].reshape(believed.shape)
     return good
 
 
 def shares_of(rows: U8, leads: Leads, channel: int, good: Mask) -> F32:
-    """Height of the leads in the other channels over their own (B,); NaN where a lead may be of another colour.
+    """Height of the leads in the other channels over their own (P, N); NaN where a lead may be of another colour.
 
     Args:
-        rows: (B, W, 3) BGR, one row of every other block.
+        rows: (P N, W, 3) BGR, one row of every other block.
         channel: the laser's own.
-        good: (B,) the leads in question.
+        good: (P, N) the leads in question.
 
     As pure as any laser is: clipped, a line's own height is too small and its share too large, never too pure.
     """
     block = np.flatnonzero(good)
-    shares = np.full(len(rows), np.nan, np.float32)
+    shares = np.full(good.size, np.nan, np.float32)
     if not block.size:
-        return shares
-    height, _ = heights_of(rows, block, np.rint(leads.column[block]).astype(np.intp))
+        return shares.reshape(good.shape)
+    height, _ = heights_of(rows, block, np.rint(leads.column.ravel()[block]).astype(np.intp))
     own, other = height[channel], np.maximum(height[channel - 1], height[channel - 2])
     # The mean over neighbours on the same line is known far better than one row's.
-    smooth = cv2.blur(np.stack([other, own]), (5, 1), borderType=cv2.BORDER_REPLICATE)
+    smooth = np.stack([other, own])
+    for part in by_picture(block // good.shape[1], len(good)):
+        if part.stop > part.start:
+            smooth[:, part] = cv2.blur(smooth[:, part], (5, 1), borderType=cv2.BORDER_REPLICATE)
     share = smooth[0] / np.maximum(smooth[1], np.float32(1.0))
     pure = (other < _PURE * own) | (share < 0.9 * _PURE)
     shares[block[pure]] = share[pure]
-    return shares
+    return shares.reshape(good.shape)
 
 
 def _halved(values: U8 | U16) -> U16:

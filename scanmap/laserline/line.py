@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import runs
-from scanmap.laserline.bars import find_bars
+from scanmap.laserline.bars import take_bars
 from scanmap.laserline.brightness import by_brightness
 from scanmap.laserline.candidates import BLOCK
-from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.colour import strangers
-from scanmap.laserline.cores import bright_core, centre_of_gravity
+from scanmap.laserline.cores import centre_of_gravity, take_cores
 from scanmap.laserline.edges import Edges, across_edges, doubt_of_edges, no_edges, sides_of
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
 from scanmap.laserline.offframe import standing_out
+from scanmap.laserline.offmatch import in_place
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
-from scanmap.laserline.pooling import TELLING, pool, segments, unexplained
+from scanmap.laserline.pooling import APART_ROWS, pool, segments, unexplained
 from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import Course, search
@@ -36,8 +36,6 @@ Index = NDArray[np.intp]
 _MARGIN = 64
 # No sample is known well enough for less.
 _SIGMA_LEAST_PX = 0.003
-# What a core must stand out by where no profile could be fitted: in noise, and in grey levels.
-_CORE_SNR, _CORE_CONTRAST = 8.0, 12.0
 # A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 # Short runs of rows known no better than this are given up, and those that stand out of what is left of the room's own
@@ -46,12 +44,9 @@ _WEAK_PX, _STANDS_OUT = 0.2, (2.5, 4.5)
 _BLOCKS_ROWS = 18
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
-# What may be wrong of a core's place, as a share of its width, however smooth the line of cores is.
-_CORE_BIAS = 0.03
-# Rows apart in which a JPEG's errors are not the same (its blocks have eight); by what factor the scatter must exceed
-# the sigmas to be believed, and may fall below them once they are known to be wrong; what is beyond the last is the
-# surface's own.
-_APART_ROWS, _MORE, _LESS, _MOST = (5, 6), 1.08, 0.5, 4.0
+# By what factor the scatter along a line must exceed the sigmas to be believed, and may fall below them once they are
+# known to be wrong; what is beyond the last is the surface's own.
+_MORE, _LESS, _MOST = 1.08, 0.5, 4.0
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
 
@@ -89,77 +84,112 @@ def look(
         still: (ceil(H / BLOCK), W) where things of the room are known to be, in blocks of rows; the line is looked
             for everywhere else.
     """
-    if image.strides[1:] != (1, 1)[: image.ndim - 1] and image.strides[1:] != (image.shape[-1], 1):
-        image = np.ascontiguousarray(image)
+    if background is not None:
+        background = in_place(image, background)
+    channel = channel_of(image, background, params.grey)
+    return _look(image[None], params, background, window, still, channel)[0]
+
+
+def look_at_all(images: U8, params: LaserLineParams, window: Array | None = None) -> list[Look]:
+    """What `look` gives for each of the pictures (P, H, W) or (P, H, W, 3) of one scan, bit for bit, sooner."""
+    channels = [channel_of(image, None, params.grey) for image in images]
+    if len(set(channels)) == 1:
+        return _look(images, params, None, window, None, channels[0])
+    each = zip(images, channels, strict=True)
+    return [_look(image[None], params, None, window, None, channel)[0] for image, channel in each]
+
+
+def _look(
+    images: U8,
+    params: LaserLineParams,
+    background: U8 | None,
+    window: Array | None,
+    still: NDArray[np.bool_] | None,
+    channel: int | None,
+) -> list[Look]:
+    """Look at pictures (P, H, W, ...) whose line is looked for in one channel."""
+    pictures, height, width = images.shape[:3]
+    # From here on, one below the other.
+    image = np.ascontiguousarray(images).reshape(pictures * height, *images.shape[2:])
     if window is None:
-        window = np.tile([0.0, image.shape[1] - 1.0], (len(image), 1))
+        window = np.tile([0.0, width - 1.0], (height, 1))
+    windows = np.tile(window, (pictures, 1))
     if params.method == "brightest":
-        channel = channel_of(image, background, params.grey)[0] if image.ndim == 3 else None
-        return Look(_brightest(to_grey(image, params.grey, params.bit_index, channel), params, window))
+        lines = _brightest(to_grey(image, params.grey, params.bit_index, max(channel or 0, 0)), params, windows)
+        return [Look(line) for line in _each(lines, height)]
     if not np.isfinite(window).any():
-        return Look(no_line(len(image), Reason.WINDOW))
+        return [Look(no_line(height, Reason.WINDOW)) for _ in images]
     # Everything below sees only the columns in question; in fours, which are summed in pairs and those again.
     left = max(0, int(np.nanmin(window)) - _MARGIN) // 4 * 4
     image = image[:, left : left + -(-(int(np.nanmax(window)) + _MARGIN + 1 - left) // 4) * 4]
     background = None if background is None else background[:, left : left + image.shape[1]]
     still = None if still is None else still[:, left : left + image.shape[1]]
-    sight = sight_of(image, background, Conversion(params.grey, params.bit_index, params.off_threshold))
+    how = Conversion(params.grey, params.bit_index, params.off_threshold)
+    sight = sight_of(image, background, how, height, channel)
     course = search(sight, window - left, params.min_snr, still)
-    line = _found(sight, course, params, window - left)
-    line.column_px[:] += left
+    lines = _found(sight, course, params, windows - left)
+    lines.column_px[:] += left
     # What does not change with the laser is gone already where there is a laser-off frame.
-    return Look(line, course.places + np.float32(left) if background is None else None)
+    places = [p + np.float32(left) if background is None else None for p in course.places]
+    return [Look(line, own) for line, own in zip(_each(lines, height), places, strict=True)]
+
+
+def _each(lines: LaserLine, height: int) -> list[LaserLine]:
+    """The lines of pictures of `height` rows one below the other, each by itself."""
+    column, peak, width, sigma, reason = (np.split(values, len(values) // height) for values in lines)
+    return [LaserLine(*one) for one in zip(column, peak, width, sigma, reason, strict=True)]  # type: ignore[arg-type]
 
 
 def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:
-    noise = sight.noise
+    noise, height = sight.noise, sight.height
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
     line, edges = _located(sight, (row, column), params)
-    _take_bars(line, sight.plane, None if sight.off is None else sight.lit, noise, params)
+    take_bars(line, sight, params)
     line = _within(line, window)
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
     at = np.flatnonzero(wide), np.rint(line.column_px[wide]).astype(np.intp)
     widest = _CORE_SHARE * line.width_px[wide]
     line = without(line, wide, Reason.WIDE)
     if params.method == "gauss" and at[0].size:
-        y, _ = samples_of(sight, *at).of(_CORE_HALF, slice(None))
-        _take_cores(line, at, y.T, widest, noise, params)
+        around = samples_of(sight, *at)
+        y, _ = around.of(_CORE_HALF, slice(None))
+        take_cores(line, at, y.T, widest, around.rows, params)
     if sight.image is not None:
-        pure = np.repeat(course.pure, BLOCK)[: len(sight.lit)]
-        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure), Reason.AMBIGUOUS)
+        pure = np.repeat(course.pure, BLOCK, axis=1)[:, :height].ravel()
+        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure, height), Reason.AMBIGUOUS)
     if sight.off is None and params.method == "gauss":
-        line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane), Reason.WIDE)
-    line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px), Reason.EDGE)
+        line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane, height), Reason.WIDE)
+    line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px, height), Reason.EDGE)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
-        height, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
-        line = without(line, height < _STANDS_OUT[0], Reason.AMBIGUOUS)
+        standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
+        line = without(line, standing < _STANDS_OUT[0], Reason.AMBIGUOUS)
         # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
         disturbed = with_ripple < _STANDS_OUT[1]
-        line = without(line, runs.crumbs(line.column_px, disturbed, _BLOCKS_ROWS), Reason.AMBIGUOUS)
+        line = without(line, runs.crumbs(line.column_px, disturbed, height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
         weak |= disturbed
-    line = without(line, runs.crumbs(line.column_px, weak), Reason.AMBIGUOUS)
+    line = without(line, runs.crumbs(line.column_px, weak, height), Reason.AMBIGUOUS)
     line.column_px[:] += edges.shift
-    line = _pooled(line, params.pool_rows)
+    line = _pooled(line, params.pool_rows, height)
     return line._replace(sigma_px=np.hypot(line.sigma_px, edges.doubt))
 
 
-def _pooled(line: LaserLine, rows: int) -> LaserLine:
-    """The line with sigmas that the scatter along it bears out, and pooled over so many rows (3 or more)."""
-    parts = segments(line.column_px, line.sigma_px)
-    more = min(unexplained(line.column_px, line.sigma_px, parts[0], _APART_ROWS), _MOST)
+def _pooled(line: LaserLine, rows: int, height: int) -> LaserLine:
+    """The lines with sigmas that the scatter along them bears out, and pooled over so many rows (3 or more)."""
+    column, sigma = line.column_px.reshape(-1, height), line.sigma_px.reshape(-1, height)
+    parts = segments(column, sigma)
+    more = np.minimum(unexplained(column, sigma, parts[0], APART_ROWS), _MOST)
     correlated = more > _MORE
-    if correlated:
-        line.sigma_px[:] *= more
-        parts = segments(line.column_px, line.sigma_px)
-    if rows < 3:
-        return line
-    pooled, sigma = pool(line.column_px, line.sigma_px, rows, parts)
-    # Errors that are alike in neighbouring rows do not average out as others do.
-    more = unexplained(pooled, sigma, parts[0], (rows + 1,))
-    if correlated or more > _MORE:
-        sigma *= min(max(more, _LESS), _MOST)
-    return line._replace(column_px=pooled, sigma_px=sigma)
+    if correlated.any():
+        sigma *= np.where(correlated, more, 1.0)[:, None]
+        parts = segments(column, sigma)
+    if rows >= 3:
+        column, sigma = pool(column, sigma, rows, parts)
+        # Errors that are alike in neighbouring rows do not average out as others do.
+        more = unexplained(column, sigma, parts[0], (rows + 1,))
+        differ = correlated | (more > _MORE)
+        sigma *= np.where(differ, np.minimum(np.maximum(more, _LESS), _MOST), 1.0)[:, None]
+    return line._replace(column_px=column.ravel(), sigma_px=sigma.ravel())
 
 
 def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> tuple[LaserLine, Edges]:
@@ -167,39 +197,42 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
 
     And what edges of the room's brightness do to its columns (H,), which is no matter of whether they are the line's.
     """
-    line, noise = no_line(len(sight.lit), Reason.WEAK), sight.noise
+    line = no_line(len(sight.lit), Reason.WEAK)
     edges = no_edges(len(sight.lit))
     row, column = at
     if not row.size:
         return line, edges
     around = samples_of(sight, row, column)
-    # Speckle is one for the frame; the largest group, which comes first, tells it best.
-    contrast = {"auto": None, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
-    for half, some in by_width(around.lit):
-        r, c = row[some], column[some]
+    # Speckle is one for a picture; the largest group, which comes first, tells it best.
+    contrast = {"auto": np.nan, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
+    contrasts = np.full(len(sight.noise), contrast)
+    for half, some in by_width(around.lit, around.rows):
+        r, c, rows = row[some], column[some], around.rows.of(some)
+        noise = rows.noise
         y, usable = around.of(half, some)
-        sides = sides_of(y, noise)
-        peaks = fit_gaussian(y, usable, noise, contrast, partial(around.of, some=some))
-        contrast = peaks.contrast
+        sides = sides_of(y, rows)
+        peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some))
+        contrasts = peaks.contrast
         reason = _judged(peaks, noise, params)
-        peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some, noise)
+        peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some)
         if sight.off is None:
-            own = across_edges(peaks, reason == Reason.OK, sides, around, half, some, noise)
+            own = across_edges(peaks, reason == Reason.OK, sides, around, half, some)
         else:
             own = doubt_of_edges(peaks, reason == Reason.OK, sight, (r, c), usable)
         offset = centre_of_gravity(y.T) if params.method == "cog" else peaks.offset_px
         dim = (reason == Reason.WEAK) & (peaks.height >= params.min_peak) & (peaks.sigma_px < _DIM_PX)
         if dim.any():
-            reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, reason == Reason.OK, dim)] = Reason.OK
+            believed = reason == Reason.OK
+            reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, believed, dim, sight.height)] = Reason.OK
         good = reason == Reason.OK
         if params.method == "gauss" and not (good.all() and not peaks.clipped.any()):
             # A wide saturated line whose flanks are no Gaussian's stands in a halo.
-            misfit = peaks.noise > _HALO_MISFIT * max(noise, 1.5)
+            misfit = peaks.noise > _HALO_MISFIT * np.maximum(noise, 1.5)
             halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & ~even
             reason[halo & good] = Reason.WIDE
             final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
             lost = (reason != Reason.OK) & ~final
-            _take_cores(line, (r[lost], c[lost]), y[:, lost].T, params.max_width_px, noise, params)
+            take_cores(line, (r[lost], c[lost]), y[:, lost].T, params.max_width_px, rows.of(lost), params)
             good = reason == Reason.OK
         k = good.nonzero()[0]
         at_good = r[k]
@@ -213,61 +246,15 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
     return line, edges
 
 
-def _take_cores(
-    line: LaserLine, at: tuple[Index, Index], y: F32, widest: float | Array, noise: float, params: LaserLineParams
-) -> None:
-    """Where the profile is no Gaussian but has a core that stands out sharply, take the core."""
-    row, column = at
-    if not row.size:
-        return
-    cores = bright_core(y)
-    sharp = (cores.contrast > max(_CORE_SNR * noise, _CORE_CONTRAST, params.min_peak)) & (np.abs(cores.offset_px) < 3.0)
-    sharp &= cores.width_px <= widest
-    r = row[sharp]
-    line.column_px[r] = column[sharp] + cores.offset_px[sharp]
-    # The contrast is over what is beside the core; the line's height is over what is beside the line.
-    beside = np.minimum(y[:, :3].mean(axis=1), y[:, -3:].mean(axis=1))
-    line.peak[r] = np.maximum(cores.contrast, y.max(axis=1) - beside)[sharp]
-    line.width_px[r] = cores.width_px[sharp]
-    line.sigma_px[r], line.reason[r] = (
-        _borne_out(line.column_px, r, cores.sigma_px[sharp], cores.width_px[sharp]),
-        Reason.OK,
-    )
-
-
-def _borne_out(column: Array, row: Index, sigma: F32, width: F32) -> Array:
-    """Sigmas (N,) of cores, which are guesses from their width, brought down to what they scatter along the line.
-
-    A halo that is stronger on one side moves all of them alike: a part of the width always remains.
-    """
-    if len(row) < TELLING:
-        return sigma.astype(np.float64)
-    columns, sigmas = (np.full(len(column), np.nan) for _ in range(2))
-    columns[row], sigmas[row] = column[row], sigma
-    factor = unexplained(columns, sigmas, segments(columns, sigmas)[0], _APART_ROWS)
-    least = np.minimum(_CORE_BIAS * width, sigma)
-    return np.asarray(np.maximum(min(factor, 1.0) * sigma, least), np.float64)
-
-
-def _take_bars(line: LaserLine, plane: U8, lit: U8 | None, noise: float, params: LaserLineParams) -> None:
-    """Rows that no profile was found in, but a saturated bar with a beam's edges."""
-    if params.method != "gauss":
-        return
-    bars = find_bars(plane, np.flatnonzero(line.reason != Reason.OK), SATURATED, noise, lit)
-    r = bars.row
-    line.column_px[r], line.sigma_px[r] = bars.column, bars.sigma_px
-    line.width_px[r], line.peak[r], line.reason[r] = bars.width_px, bars.height, Reason.OK
-
-
-def _judged(peaks: Peaks, noise: float, params: LaserLineParams) -> NDArray[np.uint8]:
+def _judged(peaks: Peaks, noise: F32, params: LaserLineParams) -> NDArray[np.uint8]:
     """Reason (N,) of each fit."""
     reason = np.full(len(peaks.height), Reason.OK, np.uint8)
-    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / max(noise, 1.0)
+    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / np.maximum(noise, 1.0)
     reason[peaks.one_sided] = Reason.EDGE
     reason[np.abs(peaks.offset_px) > 3.0 + 0.7 * peaks.width_px] = Reason.AMBIGUOUS
     reason[peaks.sigma_px > 1.5] = Reason.WEAK
     # A dim bump whose samples scatter far more than the sensor's do is texture of the room.
-    reason[(peaks.noise > 2.5 * max(noise, 1.5)) & (peaks.height < 3.5 * peaks.noise)] = Reason.AMBIGUOUS
+    reason[(peaks.noise > 2.5 * np.maximum(noise, 1.5)) & (peaks.height < 3.5 * peaks.noise)] = Reason.AMBIGUOUS
     reason[(snr < params.min_snr) | (peaks.height < params.min_peak)] = Reason.WEAK
     reason[peaks.width_px > params.max_width_px] = Reason.WIDE
     reason[peaks.width_px < 0.33] = Reason.NARROW

@@ -2,53 +2,79 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline.pictures import Rows
+
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 _CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
 _MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
+_TELLING = 128  # rows that are enough to say so
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 
 
-def noise_variance(residual: F32, weight: F32, fitted: F32 | float = 4.0) -> F32:
+def noise_variance(residual: F32, weight: F32, fitted: F32 | float, parts: Sequence[slice]) -> F32:
     """Variance (N,) of a sample of weight 1: the rows' own, its median over neighbouring rows.
 
     Args:
         residual: (n, N) what the fit leaves over.
         weight: (n, N) of the samples.
         fitted: (N,) parameters that each row's samples were fitted with.
+        parts: the rows of each picture.
 
     A row far worse than its neighbours (an edge, a second line) keeps its own.
     """
     count = (weight > 0).view(np.uint8).sum(axis=0, dtype=np.uint8)
     freedom = np.maximum(count.astype(np.float32) - fitted, np.float32(1.0))
     own = dot(weight * residual, residual) / freedom
-    groups = -(-len(own) // _ROWS_POOLED)
-    filled = np.empty(groups * _ROWS_POOLED, np.float32)
-    filled[: len(own)] = own
-    filled[len(own) :] = np.sort(own[-_ROWS_POOLED:])[len(own[-_ROWS_POOLED:]) // 2] if len(own) else 0.0
-    ordered = np.sort(filled.reshape(groups, _ROWS_POOLED), axis=1)
-    # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
-    k = float(freedom.mean()) if len(own) else 1.0
+    # Groups of neighbouring rows of one picture, the last of each filled up with its median.
+    filled = []
+    for part in parts:
+        rest = own[part][-_ROWS_POOLED:]
+        missing = -len(own[part]) % _ROWS_POOLED
+        filled += [own[part], np.sort(rest)[len(rest) // 2].repeat(missing)] if missing else [own[part]]
+    ordered = np.sort(np.concatenate(filled).reshape(-1, _ROWS_POOLED), axis=1)
     middle = ordered[:, _ROWS_POOLED // 2 - 1] + ordered[:, _ROWS_POOLED // 2]
-    common = np.repeat(middle * np.float32(0.5 / (1.0 - 2.0 / (9.0 * k)) ** 3), _ROWS_POOLED)[: len(own)]
+    common, first = np.empty_like(own), 0
+    for part in parts:
+        if rows := len(own[part]):
+            last = first - (-rows // _ROWS_POOLED)
+            # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
+            k = float(freedom[part].mean())
+            scaled = middle[first:last] * np.float32(0.5 / (1.0 - 2.0 / (9.0 * k)) ** 3)
+            common[part], first = scaled.repeat(_ROWS_POOLED)[:rows], last
     limit = np.float32(1.0) + np.sqrt(np.float32(32.0) / freedom)
     variance: F32 = np.maximum(np.where(own > limit * common, own, common), np.float32(1.0 / 12.0))
     return variance
 
 
-def speckle_contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> float:
-    """Speckle contrast: how much the scatter between neighbouring rows grows with the signal.
+def speckle_contrasts(residual: F32, signal: F32, weight: F32, rows: Rows) -> F64:
+    """Speckle contrast of each picture (P,): how much the scatter between neighbouring rows grows with the signal."""
+    contrast = np.zeros(len(rows.noise_of))
+    # Some rows tell where there is none.
+    quick = [np.arange(p.start, p.stop, max(1, (p.stop - p.start) // _TELLING)) for p in rows.parts]
+    at = np.concatenate(quick)
+    weights, left = weight.take(at, axis=1), residual.take(at, axis=1)
+    own = dot(weights * left, left) / np.maximum(weights.sum(axis=0) - np.float32(4.0), np.float32(1.0))
+    first = 0
+    for k, (some, part) in enumerate(zip(quick, rows.parts, strict=True)):
+        scatter, first = np.sort(own[first : first + len(some)]), first + len(some)
+        if len(some) and scatter[len(some) // 2] >= _MORE_SCATTER * rows.noise_of[k] ** 2:
+            noise = float(rows.noise_of[k])
+            contrast[k] = _speckle_contrast(residual[:, part], signal[:, part], weight[:, part], noise)
+    return contrast
+
+
+def _speckle_contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> float:
+    """Speckle contrast of one picture.
 
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
-    quick = slice(None, None, max(1, residual.shape[1] // 128))
-    weights, left = np.ascontiguousarray(weight[:, quick]), np.ascontiguousarray(residual[:, quick])
-    own = np.sort(dot(weights * left, left) / np.maximum(weights.sum(axis=0) - 4.0, 1.0))
-    if not len(own) or own[len(own) // 2] < _MORE_SCATTER * sample_noise**2:
-        return 0.0
     stride = max(1, residual.shape[1] // 300)
     step = residual[:, 1::stride] - residual[:, :-1:stride]
     level = np.minimum(signal[:, 1::stride], signal[:, :-1:stride])

@@ -12,6 +12,7 @@ from scanmap.laserline.candidates import BLOCK, Candidates
 from scanmap.laserline.grey import runs_at
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
 
@@ -65,24 +66,32 @@ def choose_path(candidates: Candidates, score: F32, min_snr: float) -> F32:
     return chosen
 
 
-def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: float) -> tuple[Index, Index]:
+def columns_of_rows(plane: U8, path: F32, window: F64, noise: F64) -> tuple[Index, Index]:
     """Rows (N,) that may carry the line, and the integer column (N,) of its peak in each.
+
+    Args:
+        plane: (P H, W) of P pictures below each other.
+        path: (P, B) column in each block of rows, NaN where there is none.
+        window: (P H, 2) first and last column of each row, NaN where it has none.
+        noise: (P,) of a sample [grey levels].
 
     A row looks around the column its block's path has there, interpolated along the line; near a jump it looks
     at the neighbours' columns too and takes where the line stands out most.
     """
-    row, block, place = _rows_of_blocks(len(plane))
-    step = path[1:] - path[:-1]
+    row, block, place = _rows_of_blocks(len(noise), len(plane) // len(noise))
+    step = path[:, 1:] - path[:, :-1]
     smooth = np.abs(step) <= CONNECTED_PX
-    slope = np.zeros(len(path), np.float32)
-    slope[1:-1] = np.where(smooth[1:] & smooth[:-1], 0.5 * (step[1:] + step[:-1]), 0.0) / BLOCK
-    own = path[block] + slope[block] * place
+    slope = np.zeros(path.shape, np.float32)
+    slope[:, 1:-1] = np.where(smooth[:, 1:] & smooth[:, :-1], 0.5 * (step[:, 1:] + step[:, :-1]), 0.0) / BLOCK
+    own = path.ravel()[block] + slope.ravel()[block] * place
     best, height_of_best = stand_out(plane, row, own, noise)
-    jumpy = ~np.concatenate([[True], smooth, [True]])
-    at = (jumpy[1:] | jumpy[:-1])[block].nonzero()[0]
+    jumpy = np.zeros((len(path), path.shape[1] + 1), bool)
+    jumpy[:, 1:-1] = ~smooth
+    at = (jumpy[:, 1:] | jumpy[:, :-1]).ravel()[block].nonzero()[0]
     if at.size:
-        padded = np.concatenate([[np.nan], path, [np.nan]])
-        beside = np.concatenate([padded[:-2][block[at]], padded[2:][block[at]]])
+        above, below = np.full((2, *path.shape), np.nan, np.float32)
+        above[:, 1:], below[:, :-1] = path[:, :-1], path[:, 1:]
+        beside = np.concatenate([above.ravel()[block[at]], below.ravel()[block[at]]])
         rivals, responses = stand_out(plane, np.concatenate([at, at]), beside, noise)
         for rival, response in zip(np.split(rivals, 2), np.split(responses, 2), strict=True):
             better = response > height_of_best[at] * 1.05
@@ -92,14 +101,21 @@ def columns_of_rows(plane: U8, path: F32, window: NDArray[np.float64], noise: fl
 
 
 @cache
-def _rows_of_blocks(rows: int) -> tuple[Index, Index, F32]:
-    """All rows (H,) of a picture, the block each lies in, and how far below that block's middle it is."""
-    row = np.arange(rows)
-    return row, row // BLOCK, (row % BLOCK - 0.5 * (BLOCK - 1)).astype(np.float32)
+def _rows_of_blocks(pictures: int, rows: int) -> tuple[Index, Index, F32]:
+    """All rows (P H,) of pictures, the block each lies in, and how far below that block's middle it is."""
+    row, blocks = np.tile(np.arange(rows), pictures), -(-rows // BLOCK)
+    block = row // BLOCK + np.repeat(np.arange(pictures) * blocks, rows)
+    return np.arange(pictures * rows), block, (row % BLOCK - 0.5 * (BLOCK - 1)).astype(np.float32)
 
 
-def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, F32]:
-    """The place within 5 px of `column` (N,) that stands out most, and by how much; 0 where column is NaN."""
+def stand_out(plane: U8, row: Index, column: F32, noise: F64) -> tuple[Index, F32]:
+    """The place within 5 px of `column` (N,) that stands out most, and by how much; 0 where column is NaN.
+
+    Args:
+        plane: (P H, W) of P pictures below each other.
+        row: (N,) of it.
+        noise: (P,) of a sample [grey levels].
+    """
     reach, far, core = 5, 9, 5
     known = ~np.isnan(column)
     middle = np.rint(np.where(known, column, np.float32(0.0))).astype(np.intp)
@@ -113,7 +129,8 @@ def stand_out(plane: U8, row: Index, column: F32, noise: float) -> tuple[Index, 
     side = np.maximum(smooth[: -2 * far], smooth[2 * far :])
     # Noise moves the maximum of a dim line; the path is worth something too.
     away = np.square(np.arange(-reach, reach + 1))[:, None] * (2 * core * _PATH_WORTH * noise)
-    rank = 2 * inner - side - np.minimum(away, 1000.0).astype(np.int16)
+    away = np.minimum(away, 1000.0).astype(np.int16)
+    rank = 2 * inner - side - (away if len(noise) == 1 else away[:, row // (len(plane) // len(noise))])
     # The place is packed below the rank, so that one maximum gives both: ten times the speed of argmax.
     packed = rank.astype(np.int32) * 16 + np.arange(2 * reach, -1, -1, dtype=np.int32)[:, None]
     at = 2 * reach - (packed.max(axis=0) & 15)

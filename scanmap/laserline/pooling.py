@@ -7,6 +7,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline.pictures import by_picture, not_one
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -17,15 +19,17 @@ _MISFIT = 4.5
 # Chi^2 of a bend that is kept by half; rows over which is told what shrinking it leaves of its variance, at least 0.3.
 _BEND_DOUBT, _BEND_ROWS, _BEND_LEAST = 2.0, 129, 0.3
 
+# Rows apart in which a JPEG's errors are not the same: its blocks have eight.
+APART_ROWS = (5, 6)
 TELLING = 75  # rows that tell whether sigma is too small
 
 
 def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] | None = None) -> tuple[Array, Array]:
-    """Columns and sigmas (H,) after a weighted quadratic over at most `support` rows of one segment.
+    """Columns and sigmas (..., H) after a weighted quadratic over at most `support` rows of one segment.
 
     Args:
-        column: (H,) NaN where a row has no line.
-        sigma: (H,) standard deviations.
+        column: (..., H) of one picture or several, NaN where a row has no line.
+        sigma: (..., H) standard deviations.
         support: odd number of rows.
         parts: what `segments` gives, where it is known.
 
@@ -35,73 +39,77 @@ def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] |
     """
     out_column, out_sigma = column.copy(), sigma.copy()
     start, stop = segments(column, sigma) if parts is None else parts
-    pending = np.isfinite(column)
+    pending = np.isfinite(column).ravel()
     for rows in (support, 5):
-        if rows > support or rows > len(column):
+        if rows > support or rows > column.shape[-1]:
             continue
-        at = (pending & (stop - start >= rows)).nonzero()[0]
+        at = not_one((pending & (stop - start >= rows)).nonzero()[0])
         if not at.size:
             continue
         first = np.minimum(np.maximum(at - rows // 2, start[at]), stop[at] - rows)
         fitted, spread, chi2 = _quadratic(column, sigma, at, first, rows)
         good = chi2 < _MISFIT
         good_at = at[good]
-        out_column[good_at], out_sigma[good_at] = fitted[good], spread[good]
+        out_column.reshape(-1)[good_at], out_sigma.reshape(-1)[good_at] = fitted[good], spread[good]
         pending[good_at] = False
     return out_column, out_sigma
 
 
-def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]) -> float:
-    """How much more (or less) the columns of a line scatter than their sigmas say, as a factor; 1 where too few tell.
+def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]) -> Array:
+    """How much more (or less) lines scatter than their sigmas say: a factor (P,) for each; 1 where too few rows tell.
 
     Args:
-        column: (H,) NaN where a row has no line.
-        sigma: (H,) standard deviations.
-        start: (H,) first row of the segment each row belongs to.
+        column: (P, H) of P pictures, NaN where a row has no line.
+        sigma: (P, H) standard deviations.
+        start: (P H,) first row of the segment each row belongs to, of all pictures below each other.
         lags: rows so far apart that their errors have little to do with each other.
 
     What JPEG's blocks and a camera's sharpening do to a line looks like a line moved: a row's own samples cannot tell.
     Other rows can: fourth differences of a line are zero on every surface bent no more than a cubic, and 70 variances
     of noise. The median of all rows counts, so that edges do not.
     """
-    variance = np.square(sigma)
-    squares = []
+    pictures, height = column.shape
+    if height <= 4 * max(lags):
+        return np.ones(pictures)
+    column, variance = column.ravel(), np.square(sigma).ravel()
+    told, squares = np.ones(pictures, bool), np.zeros(pictures)
     for lag in lags:
         span = 4 * lag
-        if len(column) <= span:
-            return 1.0
-        at = ((start[:-span] == start[span:]) & np.isfinite(column[:-span])).nonzero()[0][::2]
-        if len(at) < TELLING:
-            return 1.0
+        at = ((start[:-span] == start[span:]) & np.isfinite(column[:-span])).nonzero()[0]
         rows = len(column) - span
         a, b, c, d, e = (column[k : k + rows] for k in range(0, span + 1, lag))
         va, vb, vc, vd, ve = (variance[k : k + rows] for k in range(0, span + 1, lag))
         step = a + e - 4.0 * (b + d) + 6.0 * c
-        ratio = (step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc))[at]
-        middle = len(ratio) // 2
-        ratio.partition(middle)
-        squares.append(float(ratio[middle]) / 0.455)  # the median of chi^2 with one degree of freedom
-    return float(np.sqrt(sum(squares) / len(squares)))
+        ratio = step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc)
+        for k, own in enumerate(by_picture(at // height, pictures)):
+            some = ratio[at[own][::2]]
+            told[k] &= len(some) >= TELLING
+            if told[k]:
+                middle = len(some) // 2
+                some.partition(middle)
+                squares[k] += some[middle] / 0.455  # the median of chi^2 with one degree of freedom
+    return np.where(told, np.sqrt(squares / len(lags)), 1.0)
 
 
-def segments(column: Array, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and end of the segment that each row belongs to."""
-    rows = len(column)
-    step = column[1:] - column[:-1]
+def segments(column: Array, sigma: Array) -> tuple[Index, Index]:
+    """First row and end of the segment that each row of pictures (..., H) belongs to, counted through all of them."""
+    rows = column.shape[-1]
+    column, sigma = column.reshape(-1, rows), sigma.reshape(-1, rows)
+    step = column[:, 1:] - column[:, :-1]
     size = np.abs(step)
     # The slope on either side of a step; the smaller disagreement counts, so that a bend is no break.
-    bend = np.abs(step[2:] - step[:-2])
-    off = np.full(len(step), np.nan)
-    off[2:] = bend
-    np.fmin(off[:-2], bend, out=off[:-2])
+    bend = np.abs(step[:, 2:] - step[:, :-2])
+    off = np.full(step.shape, np.nan)
+    off[:, 2:] = bend
+    np.fmin(off[:, :-2], bend, out=off[:, :-2])
     off = np.where(np.isnan(off), size, off)
     variance = sigma * sigma
-    limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.sqrt(variance[1:] + variance[:-1]))
-    edge = np.ones(rows + 1, bool)
-    edge[1:-1] = ~(off <= limit) | (size > 8.0)
-    begins = edge.nonzero()[0]
-    number = np.cumsum(edge[:-1]) - 1
-    return begins[number], begins[number + 1]
+    limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.sqrt(variance[:, 1:] + variance[:, :-1]))
+    edge = np.ones(column.shape, bool)
+    edge[:, 1:] = ~(off <= limit) | (size > 8.0)
+    number = np.cumsum(edge)
+    begins = np.append(edge.ravel().nonzero()[0], edge.size)
+    return begins[number - 1], begins[number]
 
 
 def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) -> tuple[Array, Array, Array]:
@@ -110,16 +118,18 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     Most surfaces are straight over so few rows, and a bend that is not there costs half of what pooling gains: it
     is shrunk by how far it stands out of its own uncertainty (James and Stein 1961).
     """
+    height = column.shape[-1]
+    column, sigma = column.reshape(-1, height), sigma.reshape(-1, height)
     known = np.isfinite(column)
-    weight = np.where(known, 1.0 / np.square(np.maximum(sigma, 1e-4)), 0.0)
+    weight = np.where(known, 1.0 / np.square(np.maximum(sigma, 1e-4)), 0.0).ravel()
     # Near zero, so that nothing is lost where squares are subtracted.
-    base = column[known].mean()
-    y = np.where(known, column - base, 0.0)
+    base = np.where(known, column, 0.0).sum(axis=1) / np.maximum(np.count_nonzero(known, axis=1), 1)
+    y = np.where(known, column - base[:, None], 0.0).ravel()
     wy = weight * y
     # All moments of all windows at once: one row of the picture after the other, times powers of its place.
     powers = _powers(rows)
     # A window for every row of the picture, or only those asked for.
-    few = 4 * len(at) < len(column)
+    few = 4 * len(at) < len(y)
     asked: Index | slice = first if few else slice(None)
     m0, m1, m2, m3, m4 = powers @ np.ascontiguousarray(_windows(weight, rows)[:, asked])
     r0, r1, r2 = powers[:3] @ np.ascontiguousarray(_windows(wy, rows)[:, asked])
@@ -135,31 +145,35 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     # What the straight line leaves over, less what the kept part of the bend explains of it.
     chi2 = (q0 - c0 * r0 - c1 * r1 - significance * (kept * (2.0 - kept))) / max(rows - 3, 1)
     bend *= kept
-    spread = _risk(significance)
     # Each row by the polynomial of its own window, which is centred on it except at a segment's ends.
     tau = (at - first - rows // 2) * (2.0 / rows)
     own = np.arange(len(at)) if few else first
     c0, c1, b0, b1, bend = c0[own], c1[own], b0[own], b1[own], bend[own]
     off = tau * tau - b0 - b1 * tau
-    value = c0 + c1 * tau + bend * off
+    value = base[at // height] + c0 + c1 * tau + bend * off
     line = (m2[own] - 2.0 * tau * m1[own] + tau * tau * m0[own]) * per_det[own]
-    variance = line + off * off / power[own] * spread[own]
-    return base + value, np.sqrt(variance), chi2[own]
+    variance = line + off * off / power[own] * _risk(significance[own], at, column.shape)
+    return value, np.sqrt(variance), chi2[own]
 
 
-def _risk(significance: Array) -> Array:
-    """Mean square error (N,) of shrunk bends, in their variance, from their chi^2 nearby.
+def _risk(significance: Array, at: Index, shape: tuple[int, ...]) -> Array:
+    """Mean square error (N,) of shrunk bends at rows `at` (N,), in their variance, from their chi^2 nearby.
 
     Without a bend 0.3 is left of it, at the worst, where it is 3 standard deviations, 1.5. Stein's unbiased estimate
     (1981) of the risk of x^3 / (x^2 + 2), which single rows scatter too much to give.
     """
     doubtful = significance + _BEND_DOUBT
     own = 1.0 + (6.0 * _BEND_DOUBT * significance / doubtful - 2.0 * _BEND_DOUBT) / doubtful
-    rows = min(_BEND_ROWS, len(own))
-    total = np.zeros(len(own) + 1)
-    np.cumsum(own, out=total[1:])
-    first = np.clip(np.arange(len(own)) - rows // 2, 0, len(own) - rows)
-    risk: Array = np.maximum((total[first + rows] - total[first]) * (1.0 / rows), _BEND_LEAST)
+    pictures, height = shape
+    # Sums up to each row of a picture of the rows before it, and how many those are.
+    total, count = np.zeros((pictures, height + 1)), np.zeros((pictures, height + 1))
+    row, picture = at % height, at // height
+    total[picture, row + 1], count[picture, row + 1] = own, 1.0
+    np.cumsum(total, axis=1, out=total)
+    np.cumsum(count, axis=1, out=count)
+    low, high = np.maximum(row - _BEND_ROWS // 2, 0), np.minimum(row + _BEND_ROWS // 2 + 1, height)
+    mean = (total[picture, high] - total[picture, low]) / (count[picture, high] - count[picture, low])
+    risk: Array = np.maximum(mean, _BEND_LEAST)
     return risk
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline.pictures import by_picture
+
 Array = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
@@ -20,11 +22,11 @@ _NEAR_ROWS = 6  # between the rows found above and below one that is too dim alo
 _GAP_ROWS = 2  # missing rows that do not end a run
 
 
-def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask) -> Index:
+def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask, height: int) -> Index:
     """Which of N rows are too dim alone but lie where the rows found above and below say that the line is.
 
     Args:
-        row: (N,) rising.
+        row: (N,) rising, of pictures of `height` rows below each other.
         column, sigma: (N,) [px].
         good, dim: (N,) rows found, and rows in question.
     """
@@ -36,71 +38,97 @@ def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask) -> In
     share = (row[asked] - row[before]) / np.maximum(span, 1)
     off = column[asked] - (column[before] + share * (column[after] - column[before]))
     spread = np.sqrt(sigma[asked] ** 2 + 0.5 * (sigma[before] ** 2 + sigma[after] ** 2))
-    near = (span <= _NEAR_ROWS) & (np.abs(column[after] - column[before]) < 3.0 + span) & (np.abs(off) < 3.0 * spread)
+    near = (row[before] // height == row[after] // height) & (span <= _NEAR_ROWS)
+    near &= (np.abs(column[after] - column[before]) < 3.0 + span) & (np.abs(off) < 3.0 * spread)
     return np.asarray(asked[near], np.intp)
 
 
-def numbered(row: Index, column: Array, gap: int) -> Index:
+def numbered(row: Index, column: Array, gap: int, height: int) -> Index:
     """Number (N,) of the run that each of the rows (N,), rising, belongs to: no more than `gap` rows and 3 px a step.
 
     Args:
+        row: (N,) of pictures of `height` rows below each other.
         column: (N,) [px].
     """
     run = np.zeros(len(row), np.intp)
-    np.cumsum((row[1:] - row[:-1] > gap) | ~(np.abs(column[1:] - column[:-1]) < 3.0), out=run[1:])
+    np.cumsum(_breaks(row, column, gap, height), out=run[1:])
     return run
 
 
-def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: float) -> Mask:
-    """Rows (H,) far wider across the line than the sharpest good part of it, unless near and therefore bright.
+def _breaks(row: Index, column: Array, gap: int, height: int) -> Mask:
+    """Whether a run ends between each of the rows (N,) and the next, (N - 1,)."""
+    broken: Mask = (row[1:] - row[:-1] > gap) | ~(np.abs(column[1:] - column[:-1]) < 3.0)
+    if height <= row[-1]:
+        picture = row // height
+        broken |= picture[1:] != picture[:-1]
+    return broken
+
+
+def blobs(column: Array, width: Array, peak: Array, sigma: Array, noise: Array) -> Mask:
+    """Rows (P H,) far wider across the line than the sharpest good part of it, unless near and therefore bright.
 
     One beam has one width, which grows toward near things as the light does; what is wide and dim is a thing in
     the room. The width across a slanted line is its width in the row times the cosine of the slant.
+
+    Args:
+        column, width, peak, sigma: (P H,) of P pictures below each other.
+        noise: (P,) of a sample in each [grey levels].
     """
     mask = np.zeros(len(column), bool)
     with np.errstate(invalid="ignore"):
         if not (width > NO_BLOB_PX).any():
             return mask
+    pictures, rows = len(noise), len(column) // len(noise)
     found = np.isfinite(column).nonzero()[0]
+    picture = found // rows
+    slope = np.zeros((pictures, rows))
+    by_row = column.reshape(pictures, rows)
+    slope[:, 1:-1] = 0.5 * (by_row[:, 2:] - by_row[:, :-2])
+    slope = slope.ravel()[found]
+    slope = np.where(np.abs(slope) < 4.0, slope, 0.0)
+    wide, height, sigma = width[found], peak[found], sigma[found]
     # Known as well as the noise allows, or simply well.
-    bound = 1.062 * np.sqrt(width[found]) * max(noise, 1.0) / peak[found]
-    known = np.minimum(np.maximum(1.3 * bound, _CERTAIN * width[found]), _POSSIBLE * width[found])
-    certain = (sigma[found] < known) | (peak[found] > _BRIGHT)
-    if certain.sum() < 0.25 * len(found):
-        # Nothing here is surely a line, and what is wide is the room's.
-        mask[found[width[found] > NO_BLOB_PX]] = True
-        return mask
-    strong = peak[found] > 10.0 * sigma[found]
-    if strong.sum() < 20:
-        return mask
-    slope = np.zeros(len(column))
-    slope[1:-1] = 0.5 * (column[2:] - column[:-2])
-    slope = np.where(np.abs(slope) < 4.0, slope, 0.0)[found]
-    across, height = width[found] / np.sqrt(1.0 + slope**2), peak[found]
-    good, bright, middle = across[strong], height[strong], int(np.count_nonzero(strong)) // 2
-    good.partition(int(0.4 * len(good)))
-    bright.partition(middle)
-    sharp, usual = good[int(0.4 * len(good))], bright[middle]
-    blob = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < _NEAR)
-    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * usual)
-    # As wide and dim as the unevenness of a wall.
-    blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
-    mask[found[blob]] = True
+    bound = 1.062 * np.sqrt(wide) * np.maximum(noise, 1.0)[picture] / height
+    certain = (sigma < np.minimum(np.maximum(1.3 * bound, _CERTAIN * wide), _POSSIBLE * wide)) | (height > _BRIGHT)
+    across, strong = wide / np.sqrt(1.0 + slope**2), height > 10.0 * sigma
+    for own in by_picture(picture, pictures):
+        lost = _blobs_of_one(wide[own], across[own], height[own], strong[own], certain[own])
+        mask[found[own][lost]] = True
     return mask
 
 
-def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
-    """Rows (H,) at depth edges in which the light of two surfaces, or half of one's, was taken for the line.
+def _blobs_of_one(wide: Array, across: Array, height: Array, strong: Mask, certain: Mask) -> Mask:
+    """The same for the rows found (N,) of one picture, wide and across the line's own slant."""
+    if np.count_nonzero(certain) < 0.25 * len(certain):
+        # Nothing here is surely a line, and what is wide is the room's.
+        return np.asarray(wide > NO_BLOB_PX)
+    good, bright = across[strong], height[strong]
+    if len(good) < 20:
+        return np.zeros(len(wide), bool)
+    good.partition(int(0.4 * len(good)))
+    bright.partition(len(bright) // 2)
+    sharp, usual = good[int(0.4 * len(good))], bright[len(bright) // 2]
+    blob: Mask = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < _NEAR)
+    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * usual)
+    # As wide and dim as the unevenness of a wall.
+    blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
+    return blob
+
+
+def frayed(column: Array, width: Array, peak: Array, sigma: Array, rows: int) -> Mask:
+    """Rows (P H,) at depth edges in which the light of two surfaces, or half of one's, was taken for the line.
+
+    Args:
+        column, width, peak, sigma: (P H,) of pictures of `rows` rows below each other.
 
     Ends of a run that are dim and have another width than the rows further in, and rows dimmer and wider than those
     two above and two below.
     """
     mask = np.zeros(len(column), bool)
     found = np.isfinite(column).nonzero()[0]
-    if len(found) < _INNER:
+    if not found.size:
         return mask
-    at = column[found]
-    broken = (found[1:] - found[:-1] > 1) | ~(np.abs(at[1:] - at[:-1]) < 3.0)
+    broken = _breaks(found, column[found], 1, rows)
     edges = np.concatenate([[0], broken.nonzero()[0] + 1, [len(found)]])
     long = edges[1:] - edges[:-1] >= _INNER
     for end, inward in ((edges[:-1][long], 1), (edges[1:][long] - 1, -1)):
@@ -110,25 +138,27 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array) -> Mask:
             row = found[end + inward * k]
             odd = np.abs(width[row] - usual) > 0.3 * usual + 2.0 * sigma[row]
             mask[row[odd & (peak[row] < 0.6 * bright)]] = True
-    wide = np.fmax(width[:-4], width[4:])
-    bright = np.fmax(peak[:-4], peak[4:])
+    width, peak, sigma = (values.reshape(-1, rows) for values in (width, peak, sigma))
+    wide = np.fmax(width[:, :-4], width[:, 4:])
+    bright = np.fmax(peak[:, :-4], peak[:, 4:])
+    width, peak, sigma = width[:, 2:-2], peak[:, 2:-2], sigma[:, 2:-2]
     with np.errstate(invalid="ignore"):
-        shared = (width[2:-2] > 1.35 * wide + 0.1 + 4.0 * sigma[2:-2]) & (peak[2:-2] < 0.8 * bright)
-        mask[2:-2] |= shared & (peak[2:-2] < _NEAR)
+        shared = (width > 1.35 * wide + 0.1 + 4.0 * sigma) & (peak < 0.8 * bright) & (peak < _NEAR)
+    mask.reshape(-1, rows)[:, 2:-2] |= shared
     return mask
 
 
-def crumbs(column: Array, weak: Mask, least: int = 12) -> Mask:
-    """Short runs of rows (H,) that no neighbour on either side continues.
+def crumbs(column: Array, weak: Mask, rows: int, least: int = 12) -> Mask:
+    """Short runs of rows (P H,), of pictures of `rows` rows, that no neighbour on either side continues.
 
-    Of 3 rows always, and of fewer than `least` if most are `weak` (H,).
+    Of 3 rows always, and of fewer than `least` if most are `weak` (P H,).
     """
     mask = np.zeros(len(column), bool)
     found = np.isfinite(column).nonzero()[0]
     if not found.size:
         return mask
-    number = numbered(found, column[found], _GAP_ROWS + 1)
-    rows = np.bincount(number)
-    doubtful = np.bincount(number, weak[found]) > 0.5 * rows
-    mask[found[((rows < 4) | (doubtful & (rows < least)))[number]]] = True
+    number = numbered(found, column[found], _GAP_ROWS + 1, rows)
+    length = np.bincount(number)
+    doubtful = np.bincount(number, weak[found]) > 0.5 * length
+    mask[found[((length < 4) | (doubtful & (length < least)))[number]]] = True
     return mask

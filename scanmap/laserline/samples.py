@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.grey import NEIGHBOUR
 from scanmap.laserline.path import strips
+from scanmap.laserline.pictures import Rows, not_one
 from scanmap.laserline.sight import Sight
 
 F32 = NDArray[np.float32]
@@ -35,20 +36,22 @@ class Samples(NamedTuple):
 
     lit: U8  # of the laser's light
     seen: U8  # of the picture, which says where it saturates
-    beside: U8 | None  # of the neighbouring channel, where it knows more of the place; else None
+    beside: U8 | None  # of the neighbouring channel; None where it nowhere knows more of the place
     outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
-    channel: int = -1  # of the laser, where `beside` is known
-    share: float = 1.0  # of that channel in the mixture with `beside`
+    rows: Rows  # which pictures they are of
+    channel: int  # of the laser, where `beside` is known
+    smeared: NDArray[np.bool_]  # (N,) whether `beside` knows more of the place
+    share: F32  # (N,) of the laser's channel in the mixture with it
 
     def of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
         """Samples (2 half + 1, n) of some rows, and 1 where they say more than "bright", else 0."""
         span = slice(REACH - half, REACH + half + 1)
-        y = self.lit[span, some].astype(np.float32)
-        usable = self.seen[span, some] < SATURATED
+        y = _some(self.lit[span], some).astype(np.float32)
+        usable = _some(self.seen[span], some) < SATURATED
         if self.beside is not None:
-            y = _mixed(y, self.beside[span, some], usable, self.share)
+            y = _mixed(y, _some(self.beside[span], some), usable, self.share[some])
         if self.outside is not None:
-            usable &= ~self.outside[span, some]
+            usable &= ~_some(self.outside[span], some)
         return y, usable.astype(np.float32)
 
     def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
@@ -60,19 +63,26 @@ class Samples(NamedTuple):
         """
         span = slice(REACH - half, REACH + half + 1)
         assert self.beside is not None
-        own, beside = self.lit[span, some].astype(np.float32), self.beside[span, some]
+        own, beside = _some(self.lit[span], some), _some(self.beside[span], some)
         usable = beside < SATURATED
         if self.outside is not None:
-            usable &= ~self.outside[span, some]
+            usable &= ~_some(self.outside[span], some)
         share = np.float32(_BRIGHTNESS[self.channel])
-        return own * share + beside * (np.float32(1.0) - share), usable.astype(np.float32)
+        brightness: F32 = own * share
+        brightness += beside * (np.float32(1.0) - share)
+        return brightness, usable.astype(np.float32)
+
+
+def _some(values: NDArray[Any], some: Index | slice) -> NDArray[Any]:
+    """Columns of an array (n, N), which stays one row after the other in memory."""
+    return values[:, some] if isinstance(some, slice) else values.take(some, axis=1)
 
 
 def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     """The samples around integer columns (N,) of rows (N,)."""
     lit, seen = sight.lit, sight.plane
     beside = outside = None
-    if sight.image is not None and sight.colour < 1.0:
+    if sight.image is not None and (sight.colour < 1.0).any():
         across = strips(sight.image, row, column, REACH)
         y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
     else:
@@ -82,28 +92,33 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
     brightness = _BRIGHTNESS[sight.channel]
-    coarse = min(_COLOUR + _COLOUR_PER_NOISE * sight.noise, 1.0)
+    coarse = np.minimum(_COLOUR + _COLOUR_PER_NOISE * sight.noise, 1.0)
     colour = sight.colour + (1.0 - sight.colour) * coarse
-    return Samples(y, bright, beside, outside, sight.channel, brightness + colour * (1.0 - brightness))
+    share = (brightness + colour * (1.0 - brightness)).astype(np.float32)
+    rows = Rows(row // sight.height, sight.noise)
+    return Samples(
+        y, bright, beside, outside, rows, sight.channel, (sight.colour < 1.0)[rows.picture], share[rows.picture]
+    )
 
 
-def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: float) -> F32:
+def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: F32) -> F32:
     """The laser's channel with the neighbouring one in it (n, N), as high as the laser's own; whole lines only.
 
     Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
     colour, which is smeared. Two channels together hold more of the one and less of the other. What JPEG rounds of
     colour moves all rows of an upright line alike, which no pooling takes out.
     """
-    mixed = own * np.float32(share)
-    mixed += beside * np.float32(1.0 - share)
-    mixed *= np.float32(1.0 / (share + (1.0 - share) * _LIGHT))
+    rest = np.float32(1.0) - share
+    mixed = own * share
+    mixed += beside * rest
+    mixed *= np.float32(1.0) / (share + rest * np.float32(_LIGHT))
     cut = (usable.min(axis=0) < 1).nonzero()[0]
-    mixed[:, cut] = own[:, cut]
+    mixed[:, cut] = own.take(cut, axis=1)
     return mixed
 
 
-def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
-    """The rows of `Samples.lit` sorted by how wide their line roughly is, most rows first: (half window, rows)."""
+def by_width(lit: U8, rows: Rows) -> Sequence[tuple[int, Index | slice]]:
+    """The rows of `Samples.lit` by how wide their line roughly is: (half window, rows), most of a picture's first."""
     top = (lit[REACH - 1].astype(np.int16) + lit[REACH] + lit[REACH + 1]) // 3
     # The brighter side counts: beside an edge of the room the run would never end at the darker one's level.
     sides = np.maximum(lit[4:12].sum(axis=0, dtype=np.int16), lit[-12:-4].sum(axis=0, dtype=np.int16)) >> 3
@@ -115,21 +130,23 @@ def by_width(lit: U8) -> Sequence[tuple[int, Index | slice]]:
     left = np.minimum((above[REACH::-1] + distance).min(axis=0), REACH + 1).astype(np.int16)
     right = np.minimum((above[REACH:] + distance).min(axis=0), REACH + 1)
     full = left + right - 1
-    # A stray wide row or two are fitted with the others, a few with the widest.
-    wide = np.count_nonzero(full > _WINDOWS[0][1])
-    if wide <= _STRAY * len(full):
+    # A stray wide row or two of a picture are fitted with the others, a few with the widest.
+    picture, pictures = rows.picture, len(rows.noise_of)
+    wide = np.bincount(picture, full > _WINDOWS[0][1], pictures)
+    stray = wide <= _STRAY * np.bincount(picture, minlength=pictures)
+    if stray.all() and len(full) > 1:
         return [(_WINDOWS[0][0], slice(None))]
-    few = wide < _FEW and full.max() > _WINDOWS[1][1]
-    found, lower = [], -2
-    for half, upper in (_WINDOWS[0], _WINDOWS[-1]) if few else _WINDOWS:
-        rows = ((full > lower) & (full <= upper)).nonzero()[0]
-        lower = upper
-        if rows.size:
-            found.append((half, rows))
-    return sorted(found, key=lambda group: -len(group[1]))
+    widest = np.bincount(picture, full > _WINDOWS[1][1], pictures)
+    few = (wide < _FEW) & (widest > 0)
+    group = np.where(full > _WINDOWS[1][1], 2, full > _WINDOWS[0][1])
+    group = np.where(stray[picture], 0, np.where(few[picture], 2 * (group > 0), group))
+    count = np.bincount(3 * picture + group, minlength=3 * pictures).reshape(-1, 3)
+    rank = (-count).argsort(axis=1, kind="stable").argsort(axis=1)
+    turn = 3 * rank[picture, group] + group
+    return [(_WINDOWS[k % 3][0], not_one((turn == k).nonzero()[0])) for k in np.unique(turn)]
 
 
-def levelled(y: F32, x: F32, sample_noise: float) -> tuple[F32, F32, F32]:
+def levelled(y: F32, x: F32, noise: F32) -> tuple[F32, F32, F32]:
     """Windows with the ramp between their two ends taken out, where it is more than noise; their lower ends and tops.
 
     A line beside an edge of the room's own brightness would be fitted too wide. Everywhere else a ramp as a fifth
@@ -139,10 +156,10 @@ def levelled(y: F32, x: F32, sample_noise: float) -> tuple[F32, F32, F32]:
     ramp = right - left
     low, top = np.minimum(left, right), y.max(axis=0)
     height = top - np.maximum(left, right)
-    least = np.float32(4.5 * sample_noise * np.sqrt(2.0 / _end(y)))
+    least = np.float32(4.5 * np.sqrt(2.0 / _end(y))) * noise
     steep = (np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height)).nonzero()[0]
     if steep.size:
-        even = y[:, steep] - ramp[steep] * (x / np.float32(len(x) - _end(y)))
+        even = y.take(steep, axis=1) - ramp[steep] * (x / np.float32(len(x) - _end(y)))
         y[:, steep] = even
         low[steep], top[steep] = np.minimum(*ends(even)), even.max(axis=0)
     return y, low, top

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import cv2
@@ -12,10 +13,12 @@ from scanmap.laserline.candidates import BLOCK, is_large, noise_of
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
-from scanmap.laserline.offmatch import at_exposure, in_place
+from scanmap.laserline.offmatch import at_exposure
 
 U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
 
+ONE_FOR_ALL = -1  # the channel of a colour picture without colour
 
 # Noise of the difference of two channels over that of one, from which on they are independent; below, in grey levels,
 # no difference is measured.
@@ -31,52 +34,79 @@ class Conversion(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """One picture, seen in the laser's light."""
+    """P pictures of one view, one below the other, seen in the laser's light."""
 
-    on: U8  # (H, W) the picture's plane; a view where one of its channels will do
-    off: U8 | None  # (H, W) the laser-off frame's
-    plane: U8  # (H, W) the brighter of both
-    lit: U8  # (H, W) what the laser added, lifted by PEDESTAL, with a laser-off frame; else the plane
-    rows: U8  # (ceil(B / 2), W) of lit: one row of every other block, contiguous
-    image: U8 | None  # (H, W, 3) where colour tells the laser from other things
+    height: int  # H, rows of a picture
+    on: U8  # (P H, W) the pictures' plane; a view where one of their channels will do
+    off: U8 | None  # (H, W) the laser-off frame's, of a single picture
+    plane: U8  # (P H, W) the brighter of both
+    lit: U8  # (P H, W) what the laser added, lifted by PEDESTAL, with a laser-off frame; else the plane
+    rows: U8  # (P ceil(B / 2), W) of lit: one row of every other block, contiguous
+    image: U8 | None  # (P H, W, 3) where colour tells the laser from other things
+    image_rows: U8 | None  # (P ceil(B / 2), W, 3) of image
     channel: int  # of the image; -1 without one
-    noise: float  # of a sample of lit [grey levels]
-    colour: float = 1.0  # how finely it is stored: 0 where the channels' noise is one, 1 where they are independent
+    noise: F64  # (P,) of a sample of lit [grey levels]
+    colour: F64  # (P,) how finely it is stored: 0 where the channels' noise is one, 1 where they are independent
     gain: float = 1.0  # that the laser-off frame's exposure is matched by
 
+    @property
+    def large(self) -> bool:
+        """Whether most of a picture need never be looked at."""
+        return is_large(self.lit[: self.height])
 
-def sight_of(image: U8, background: U8 | None, how: Conversion) -> Sight:
-    """Look at a grey (H, W) or BGR picture (H, W, 3), with the laser-off frame of the same view or None."""
-    channel = None
-    if background is not None:
-        background = in_place(image, background)
-    if image.ndim == 3:
-        channel, clear = channel_of(image, background, how.grey)
-        if channel is not None and not clear and without_colour(image):
-            # A monochrome camera's picture in three equal channels.
-            channel, image, background = None, image[..., 1], background if background is None else background[..., 1]
+    def pictures(self) -> Iterator[Sight]:
+        """Each picture by itself."""
+        for k in range(len(self.noise)):
+            own = slice(k * self.height, (k + 1) * self.height)
+            on, plane, lit, image = (None if v is None else v[own] for v in (self.on, self.plane, self.lit, self.image))
+            assert on is not None and plane is not None and lit is not None
+            one = slice(k, k + 1)
+            yield self._replace(
+                on=on, plane=plane, lit=lit, image=image, noise=self.noise[one], colour=self.colour[one]
+            )
+
+
+def sight_of(image: U8, background: U8 | None, how: Conversion, height: int, channel: int | None) -> Sight:
+    """Look at pictures.
+
+    Args:
+        image: grey (P H, W) or BGR (P H, W, 3), pictures of `height` rows one below the other.
+        background: the laser-off frame of the same view, moved onto a single picture; or None.
+        how: colour becomes one plane.
+        channel: as `channel_of` has it.
+    """
+    if channel == ONE_FOR_ALL:
+        channel, image, background = None, image[..., 1], None if background is None else background[..., 1]
+    large = is_large(image[:height])
+    pictures = range(0, len(image), height)
     if channel is not None and background is None:
-        rows = np.asarray(cv2.extractChannel(quick_rows(image), channel), np.uint8)
+        seen = np.concatenate([quick_rows(image[k : k + height]) for k in pictures])
+        rows = np.asarray(cv2.extractChannel(seen, channel), np.uint8)
         # Most of a large picture is never looked at.
-        plane = image[..., channel] if is_large(image) else extract(image, channel)
-        return Sight(plane, None, plane, plane, rows, image, channel, _noise(plane, rows), _fineness(image, channel))
+        plane = image[..., channel] if large else extract(image, channel)
+        colour = [_fineness(image[k : k + height], channel) for k in pictures]
+        noise = _noises(plane, rows, height)
+        return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, np.array(colour))
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off, gain = None, 1.0
     if background is not None:
         off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
-    rows = np.ascontiguousarray(quick_rows(lit))
-    return Sight(on, off, plane, lit, rows, None, -1, _noise(lit, rows), gain=gain)
+    rows = np.concatenate([quick_rows(lit[k : k + height]) for k in pictures])
+    noise = _noises(lit, rows, height)
+    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, np.ones(len(noise)), gain)
 
 
-def channel_of(image: U8, background: U8 | None, grey: Grey) -> tuple[int | None, bool]:
-    """The channel of a BGR picture that the line is looked for in, and whether the laser is surely seen there.
+def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
+    """The channel of a picture (H, W) or (H, W, 3) that the line is looked for in.
 
-    None for a conversion that mixes the channels.
+    None for a grey picture or a conversion that mixes the channels, ONE_FOR_ALL where the three are one.
     """
-    if grey == "auto":
-        return judged_channel(image, background)
-    return CHANNEL.get(grey), False
+    if image.ndim == 2:
+        return None
+    channel, clear = judged_channel(image, background) if grey == "auto" else (CHANNEL.get(grey), False)
+    # A monochrome camera's picture in three equal channels.
+    return ONE_FOR_ALL if channel is not None and not clear and without_colour(image) else channel
 
 
 def quick_rows(image: U8) -> U8:
@@ -85,9 +115,12 @@ def quick_rows(image: U8) -> U8:
     return rows if len(rows) == -(-len(image) // (2 * BLOCK)) else np.concatenate([rows, image[-1:]])
 
 
-def _noise(plane: U8, rows: U8) -> float:
+def _noises(plane: U8, rows: U8, height: int) -> F64:
+    """Noise (P,) of a sample of pictures of `height` rows."""
     # What is in the cache already, where it is enough.
-    return noise_of(rows if is_large(plane) else plane)
+    if is_large(plane[:height]):
+        return np.array([noise_of(some) for some in np.split(rows, len(plane) // height)])
+    return np.array([noise_of(plane[k : k + height]) for k in range(0, len(plane), height)])
 
 
 def _fineness(image: U8, channel: int) -> float:
