@@ -131,9 +131,11 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     # A window for every row of the picture, or only those asked for.
     few = 4 * len(at) < len(y)
     asked: Index | slice = first if few else slice(None)
-    m0, m1, m2, m3, m4 = powers @ np.ascontiguousarray(_windows(weight, rows)[:, asked])
-    r0, r1, r2 = powers[:3] @ np.ascontiguousarray(_windows(wy, rows)[:, asked])
-    q0 = _windows(wy * y, rows)[:, asked].sum(axis=0)
+    windows = [np.ascontiguousarray(_windows(values, rows)[:, asked]) for values in (weight, wy, wy * y)]
+    # Not BLAS, whose sums depend on how many windows there are.
+    m0, m1, m2, m3, m4 = np.einsum("kr,rn->kn", powers, windows[0])
+    r0, r1, r2 = np.einsum("kr,rn->kn", powers[:3], windows[1])
+    q0 = windows[2].sum(axis=0)
     # The straight line first, then what the bend adds to it, orthogonal to it.
     per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
     c0, c1 = (m2 * r0 - m1 * r1) * per_det, (m0 * r1 - m1 * r0) * per_det

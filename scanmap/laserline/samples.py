@@ -157,7 +157,7 @@ def levelled(y: F32, x: F32, noise: F32) -> tuple[F32, F32, F32]:
     low, top = np.minimum(left, right), y.max(axis=0)
     height = top - np.maximum(left, right)
     least = np.float32(4.5 * np.sqrt(2.0 / _end(y))) * noise
-    steep = (np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height)).nonzero()[0]
+    steep = not_one((np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height)).nonzero()[0])
     if steep.size:
         even = y.take(steep, axis=1) - ramp[steep] * (x / np.float32(len(x) - _end(y)))
         y[:, steep] = even

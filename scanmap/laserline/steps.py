@@ -80,7 +80,8 @@ def first_guess(y: F32, x: F32, b: F32, top: F32) -> Fit:
     A = np.maximum(top - b, np.float32(1.0))
     above *= above > np.float32(0.25) * A
     area = above.sum(axis=0)
-    u = _clipped((x[:, 0] @ above) / np.maximum(area, np.float32(1.0)), -2.0, 2.0)
+    # Not BLAS, whose sums depend on how many rows there are.
+    u = _clipped(dot(above, np.broadcast_to(x, above.shape)) / np.maximum(area, np.float32(1.0)), -2.0, 2.0)
     s = _clipped(area / (A * np.float32(2.35)), 0.7, 0.3 * len(x))
     return Fit(u, s, A, b, np.zeros_like(b))
 
