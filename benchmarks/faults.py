@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from scanmap import session
@@ -27,8 +28,8 @@ from scanmap.recording import describe, open_source
 from scanmap.scan.formats import read_ply
 from scanmap.session import preparing, rigs
 from scanmap.session.rigs import OpenRig, TwinDevices, open_rig
-from scanmap.shot import Shot
-from scanmap.sweep.matching import same_line, shift_between
+from scanmap.shot import Shot, decode_image
+from scanmap.sweep.matching import shift_between
 from scanmap.twin import TruthReport
 
 SETTINGS = (
@@ -173,6 +174,20 @@ def scan(
     except (ScanmapError, OSError) as raised:
         error = raised
     return result, error, writes[0], at_fault[0], bool(opened) and opened[0].twin.firmware.laser_on  # type: ignore[union-attr]
+
+
+def line_of(image: bytes) -> np.ndarray:
+    """(H,) column of the brightest thing of each row; NaN where nothing stands out."""
+    grey = decode_image(image, grey=True).image.astype(np.float32)
+    sharp = grey - cv2.GaussianBlur(grey, (0, 0), 8.0)
+    return np.where(sharp.max(axis=1) > 15.0, sharp.argmax(axis=1), np.nan)
+
+
+def same_line(before: bytes, after: bytes) -> bool:
+    """Whether two pictures show the laser line in the same columns; speckle and noise move a few rows of it."""
+    first, second = line_of(before), line_of(after)
+    seen = np.isfinite(first) & np.isfinite(second)
+    return bool(seen.any() and (np.abs(first - second)[seen] > 1.0).mean() < 0.05)
 
 
 def is_elsewhere(shot: Shot, clean: Shot) -> bool:
