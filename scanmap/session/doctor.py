@@ -185,7 +185,9 @@ def _speed(opened: OpenRig, config: Config, head: Calibration, frame: Frame) -> 
 def _disk(config: Config, folder: Path, picture_bytes: int) -> Finding:
     free = shutil.disk_usage(folder).free
     frames = len(plan(config.sweep).bearings) * (2 if config.sweep.off_frames else 1)
-    need = frames * picture_bytes + config.recording.min_free_mb * MB
+    need, kept = frames * picture_bytes, config.recording.min_free_mb * MB
     words = f"{free / MB:.0f} MB free, a scan of {frames} pictures needs {need / MB:.0f}"
-    fits = free > need
+    if kept:
+        words += f", and {kept / MB:.0f} MB are to stay free (recording.min_free_mb)"
+    fits = free > need + kept
     return Finding("disk", "ok" if fits else "fault", words + ("" if fits else ": free some, or record elsewhere"))

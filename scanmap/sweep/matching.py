@@ -111,9 +111,34 @@ def difference(before: bytes, after: bytes) -> float:
     first, second = (_small(image)[0] for image in (before, after))
     if first.shape != second.shape:
         raise CameraError(f"pictures of {first.shape} and {second.shape} pixels cannot be compared")
-    apart = first - second
-    apart -= apart.mean(axis=1, keepdims=True)  # lamps that flicker make some rows darker, all along
-    return float(cv2.GaussianBlur(apart, (0, 0), SMOOTH_PX).std())
+    return _unevenness(first - second)
+
+
+def line_difference(before: bytes, after: bytes) -> float:
+    """By how much two encoded pictures differ in what is sharp: the line, not the light of a room [grey levels, rms].
+
+    Raises:
+        CameraError: a picture cannot be decoded, or the two have different sizes.
+    """
+    first, second = (_small(image)[0] for image in (before, after))
+    if first.shape != second.shape:
+        raise CameraError(f"pictures of {first.shape} and {second.shape} pixels cannot be compared")
+    return _unevenness(_sharp(first) - _sharp(second))
+
+
+def contrast(image: bytes) -> float:
+    """By how much the parts of an encoded picture differ, as `difference` counts [grey levels, rms].
+
+    Raises:
+        CameraError: it cannot be decoded.
+    """
+    return _unevenness(_small(image)[0])
+
+
+def _unevenness(apart: F32) -> float:
+    # Lamps that flicker make some rows darker, all along.
+    along = apart - apart.mean(axis=1, keepdims=True)
+    return float(cv2.GaussianBlur(along, (0, 0), SMOOTH_PX).std())
 
 
 def scale_of(width: int) -> float:

@@ -18,7 +18,7 @@ from scanmap.errors import StageError
 from scanmap.rig import Rig
 from scanmap.shot import Shot, Withdrawal
 from scanmap.sweep.planning import Plan
-from scanmap.sweep.watching import Doubt, Verdict, Watch
+from scanmap.sweep.watching import WITNESSES, Doubt, Verdict, Watch
 
 FAR_RAD = math.radians(50.0)  # from there everything looks different
 SAME_SHARE = 0.25  # by which two measures of one slip may differ: nearness of things
@@ -119,12 +119,19 @@ class Proof:
         if watch is None or watch.first is None:
             return
         if watch.unlit and watch.brightest is not None:
-            best = watch.brightest
-            if watch.is_laser_out(self._shoot(Place(best.index, best.bearing_commanded))):
-                self._withdraw(watch.unlit, Withdrawal.LINE)
-                raise self._laser_out(best)
+            self._look_for_the_line(watch, watch.brightest)
         if self._park:
             self._look_from_the_beginning(watch, watch.first)
+
+    def _look_for_the_line(self, watch: Watch, best: Shot) -> None:
+        again = self._look(best)
+        if not watch.is_laser_out(again):
+            return
+        if watch.last is None or not (wrong := self._why_dark(best, again, watch.last)):
+            self._withdraw(watch.unlit, Withdrawal.LINE)
+            raise self._laser_out(best)
+        unlit = [place for place in self._taken if place.index in watch.unlit]
+        self._lost_place([*unlit, *self._suspects(watch, watch.last, again)], _off_the_board(wrong))
 
     def _look_from_the_beginning(self, watch: Watch, first: Shot) -> None:
         again = self._look(first)
@@ -136,6 +143,8 @@ class Proof:
             since_last = not self._open
         elif off_px:
             since_last = self._is_off_since_last(watch, first, off_px)
+        elif self._open and watch.shift(first, again) is None:
+            wrong = self._moved_lines(watch)
         if not wrong or since_last:
             self._open.clear()
             if wrong:
@@ -150,6 +159,17 @@ class Proof:
                 f"trusted and are left out: {CHECK_IT}"
             ),
         )
+
+    def _moved_lines(self, watch: Watch) -> str:
+        """Where the room is too dark or plain to be matched: what the laser line says, in words; else empty."""
+        if watch.last is None or len(watch.telling) < WITNESSES:
+            return ""
+        noise_dn = watch.line_change(watch.last, self._look(watch.last))  # of going away and coming back
+        moved = [shot for shot in watch.telling if watch.has_moved(shot, self._look(shot), noise_dn)]
+        if len(moved) < WITNESSES:
+            return ""
+        places = " and ".join(f"{math.degrees(shot.bearing):.2f}" for shot in moved)
+        return f"the laser line at {places} deg is not where it was"
 
     def _is_off_since_last(self, watch: Watch, first: Shot, off_px: float) -> bool:
         """Whether a head that is off at its first bearing is off at its last by just as much, and goes no farther off.
@@ -180,24 +200,20 @@ class Proof:
         logger.info("shot %d: %s; looking again from %.2f deg", shot.index, doubt.value, math.degrees(trusted.bearing))
         rehomings_left = self.rehomings_left
         again = self._look(trusted)
-        if doubt is Doubt.LASER:
-            if watch.is_laser_out(again):
-                raise self._laser_out(trusted)
+        if doubt is not Doubt.LASER:
+            wrong = self._what_is_wrong(trusted, again, shot)
+        elif not watch.is_laser_out(again):
             watch.pardon(doubt)
             # A loose contact puts the laser out for one picture only; where there is no line, the first will do.
             other = self._look(shot)
             return (shot if watch.is_laser_out(other) else other), Verdict(is_proved=watch.agrees(shot, other))
-        while wrong := self._what_is_wrong(trusted, again, shot):
-            after = [Place(open_.index, open_.bearing_commanded) for open_ in watch.since(trusted) if open_.index >= 0]
-            spoiled = [*self._open, *(place for place in after if place not in self._open)]
-            self._lost_place(
-                spoiled,
-                StageError(
-                    f"the head is not where its board says, for steps were lost or the motor stalled: {wrong}; "
-                    f"{CHECK_IT}"
-                ),
-            )
+        elif not (wrong := self._why_dark(trusted, again, shot)):
+            raise self._laser_out(trusted)
+        while wrong:
+            self._lost_place(self._suspects(watch, trusted, shot), _off_the_board(wrong))
+            trusted = watch.reference(shot) or trusted
             again = self._look(trusted)
+            wrong = self._what_is_wrong(trusted, again, shot)
         watch.pardon(doubt)
         proved = watch.agrees(trusted, again)
         if self.rehomings_left == rehomings_left and doubt is not Doubt.STILL and not watch.is_torn(shot):
@@ -219,21 +235,40 @@ class Proof:
                 return ""
         return "the picture does not change, however far it is told to turn"
 
+    def _why_dark(self, lit: Shot, again: Shot, shot: Shot) -> str:
+        """What is wrong with the head where another look shows no line; empty where it is the laser."""
+        watch = self._watch
+        # With a dead laser a dark room looks the same from everywhere; that proves nothing against the motor.
+        return "" if watch is None or watch.shows_nothing(again) else self._what_is_wrong(lit, again, shot)
+
+    def _suspects(self, watch: Watch, trusted: Shot, shot: Shot) -> list[Place]:
+        """The open shots, and those that a place lost since the trusted one spoils."""
+        after = (Place(late.index, late.bearing_commanded) for late in watch.suspects(trusted, shot) if late.index >= 0)
+        return [*self._open, *after]
+
     def _look(self, shot: Shot) -> Shot:
         return self._shoot(Place(shot.index, shot.bearing_commanded))
 
     def _lost_place(self, spoiled: Iterable[Place], error: StageError) -> None:
         """Withdraw what cannot be trusted; home again where that is possible, else raise."""
-        spoiled = list(spoiled)
-        if spoiled:
-            self._withdraw([place.index for place in spoiled], Withdrawal.PLACE)
-        self._taken = [place for place in self._taken if place not in spoiled]
+        lost = {place.index: place for place in spoiled}
+        if lost:
+            self._withdraw(lost.keys(), Withdrawal.PLACE)
+        if self._watch is not None:
+            self._watch.forget(lost.keys())
+        self._taken = [place for place in self._taken if place.index not in lost]
         self._open.clear()
         self.home_again(error)
-        self._again += spoiled
+        self._again += lost.values()
 
     def _laser_out(self, lit: Shot) -> StageError:
         return StageError(
             f"the laser has gone out: no line at {math.degrees(lit.bearing):.2f} deg, where there was one; "
             "check its supply and wiring, then go on with scanmap scan --resume"
         )
+
+
+def _off_the_board(wrong: str) -> StageError:
+    return StageError(
+        f"the head is not where its board says, for steps were lost or the motor stalled: {wrong}; {CHECK_IT}"
+    )

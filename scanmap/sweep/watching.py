@@ -7,14 +7,14 @@ A board counts the steps it sends, not those that the motor makes. A picture tha
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from enum import Enum
 from math import degrees
 from typing import NamedTuple
 
 from scanmap.errors import CameraError
 from scanmap.shot import Shot
-from scanmap.sweep.matching import Shift, difference, scale_of, shift_between
+from scanmap.sweep.matching import Shift, contrast, difference, line_difference, scale_of, shift_between
 
 Lit = Callable[[bytes, bytes | None], float]  # share of rows that show the laser line, of a picture and its background
 
@@ -23,6 +23,8 @@ LIT_BEFORE, LIT_NOW = 0.1, 0.01  # shares of rows between which a laser that sho
 FARTHEST = 0.15  # of the picture's width: pictures farther apart have too little in common
 REACH_PX = 8.0  # [px of the small pictures] what lies nearer together shows too little of a turn
 SAME_NOISE, SAME_DN = 1.5, 0.05  # of the difference that noise makes, [grey levels]: pictures of one place have less
+TELLING = 5.0  # times the noise: so much a turn must change the line, to tell one place from the other
+WITNESSES = 2  # such places, far apart: somebody may stand in the one or the other
 FALSE_ALARMS = 3  # so many, and the pictures of this room are no witness
 
 
@@ -71,6 +73,8 @@ class Watch:
         self._recent: deque[Shot] = deque()  # trusted, the newest last
         self._standing: Shot | None = None
         self._noise_dn: float | None = None  # by which two pictures of one place differ
+        self._line_noise_dn = 0.0  # the same, of what is sharp in them
+        self._telling: list[tuple[float, Shot]] = []  # by how much the turn there changed the line [grey levels]
         self.first: Shot | None = None
         self.brightest: Shot | None = None  # that showed most of the line
         self._most_lit = 0.0
@@ -91,7 +95,7 @@ class Watch:
     def learn(self, image: bytes, again: bytes) -> None:
         """Two pictures of one place, moments apart: so much differs where nothing has changed."""
         try:
-            self._noise_dn = difference(image, again)
+            self._noise_dn, self._line_noise_dn = difference(image, again), line_difference(image, again)
         except CameraError:
             self._noise_dn = 0.0
 
@@ -115,10 +119,39 @@ class Watch:
             self.unlit = [*self.unlit, shot.index] if self.dark else []
             if lit > self._most_lit:
                 self._most_lit, self.brightest = lit, shot
+        self._keep_if_telling(shot)
         self._recent.append(shot)
         # Of those farther back than a turn that shows, one is enough.
         while len(self._recent) > 2 and self._turned_px(self._recent[1], shot) >= self._reach_px:
             self._recent.popleft()
+
+    @property
+    def telling(self) -> list[Shot]:
+        """Early shots, far apart, whose line tells whether the head stands where it stood; one, or none, at times."""
+        return [shot for _, shot in self._telling]
+
+    def has_moved(self, shot: Shot, again: Shot, noise_dn: float) -> bool:
+        """Whether the line of another look at one of the telling shots is another one, against the noise of a look."""
+        turn_dn = next(turn_dn for turn_dn, telling in self._telling if telling is shot)
+        change_dn = self.line_change(shot, again) - noise_dn
+        return turn_dn > TELLING * noise_dn and change_dn > WAY_SHARE * (turn_dn - noise_dn)
+
+    def _keep_if_telling(self, shot: Shot) -> None:
+        before = self.reference(shot)
+        if before is None or len(self._telling) == WITNESSES or self._turned_px(before, shot) < self._reach_px / 2:
+            return
+        turn_dn = self.line_change(before, shot)
+        is_far = all(self._turned_px(other, shot) > FARTHEST * self._width for other in self.telling)
+        if is_far and self._line_noise_dn and turn_dn > TELLING * self._line_noise_dn:
+            self._telling.append((turn_dn, shot))
+
+    @staticmethod
+    def line_change(before: Shot, after: Shot) -> float:
+        """By how much the laser lines of two shots differ [grey levels, rms]."""
+        try:
+            return line_difference(before.image, after.image)
+        except CameraError:
+            return 0.0
 
     def reference(self, shot: Shot) -> Shot | None:
         """What a shot is held against: the newest trusted one that is far enough from it to show a turn."""
@@ -127,10 +160,27 @@ class Watch:
                 return before
         return self._recent[0] if self._recent else None
 
-    def since(self, reference: Shot) -> list[Shot]:
-        """The trusted shots that came after one of them."""
+    def suspects(self, reference: Shot, shot: Shot) -> list[Shot]:
+        """Trusted shots that are spoiled where the head lost its place between a shot and what that was held against.
+
+        A head that has not moved since the reference may have come to a stand on its way there, and so near that nobody
+        doubted: shots that show the same belong to them, but not the first, for something must be left to go on from.
+        """
         recent = list(self._recent)
-        return recent[recent.index(reference) + 1 :] if reference in recent else []
+        begin = recent.index(reference) + 1 if reference in recent else len(recent)
+        while begin and recent[begin - 1] not in (self.first, self._standing) and self.same(recent[begin - 1], shot):
+            begin -= 1
+        return recent[begin:]
+
+    def forget(self, indices: Collection[int]) -> None:
+        """Shots with these indices are trusted no more: nothing is held against them."""
+        self._recent = deque(shot for shot in self._recent if shot.index not in indices)
+        if self.first is not None and not self._recent:
+            self._recent.append(self.first)
+        self.unlit = [index for index in self.unlit if index not in indices]
+        self._telling = [entry for entry in self._telling if entry[1].index not in indices]
+        if self.brightest is not None and self.brightest.index in indices:
+            self.brightest, self._most_lit = None, 0.0
 
     def judge(self, shot: Shot) -> Verdict:
         """What is odd about a shot; nothing where nothing is, or nothing can be told."""
@@ -195,6 +245,13 @@ class Watch:
             return difference(shot.image, elsewhere.image) <= SAME_NOISE * (self._noise_dn or 0.0) + SAME_DN
         except CameraError:
             return False
+
+    def shows_nothing(self, shot: Shot) -> bool:
+        """Whether a picture is dark, or plain, but for noise: then no other looks different."""
+        try:
+            return contrast(shot.image) <= SAME_NOISE * (self._noise_dn or 0.0) + SAME_DN
+        except CameraError:
+            return True
 
     def is_torn(self, shot: Shot) -> bool:
         """Whether the head has moved between the two pictures of a shot."""
