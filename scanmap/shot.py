@@ -137,8 +137,11 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def _rows_before_fill(pixels: Image) -> int:
-    """Rows above the uniform area a decoder fills in where a JPEG was cut, less one block for the cut row."""
+    """Rows above the uniform area a decoder fills in where a JPEG was cut, less one block for the cut row.
+
+    Where colour has half the rows (4:2:0) it is interpolated: a row on either side of the block has some of it, too.
+    """
     flat = pixels.reshape(pixels.shape[0], -1)
     differs = (flat != flat[-1]).any(axis=1)
     last = int(np.flatnonzero(differs)[-1]) + 1 if differs.any() else 0
-    return max(0, last - 16) if last < len(flat) else len(flat)
+    return max(0, last - 18) if last < len(flat) else len(flat)

@@ -60,6 +60,19 @@ def test_directions_of_a_covariance_give_it_back() -> None:
     assert steps.T @ steps == pytest.approx(known().matrix, rel=1e-9)
 
 
+def test_the_budget_is_that_of_the_points_of_each_band() -> None:
+    scan = box_scan(np.arange(0, 90, 10), rows=60, sigma_px=0.1)
+    summary = summarise(scan)
+    ranges = scan.range_m[scan.valid]
+    assert sum(band.points for band in summary.budget) == summary.points == scan.valid.sum()
+    assert len(summary.budget) > 2
+    for band in summary.budget:
+        inside = np.sort(scan.sigma_m[scan.valid & (scan.range_m >= band.near_m) & (scan.range_m < band.far_m)])
+        below = np.searchsorted(inside, [band.sigma_median_m, band.sigma_p95_m], side="right") / len(inside)
+        assert below == pytest.approx([0.5, 0.95], abs=1.5 / len(inside))
+    assert (summary.range_min_m, summary.range_max_m) == (ranges.min(), ranges.max())
+
+
 def test_the_budget_prints_it_beside_the_noise(capsys: pytest.CaptureFixture[str]) -> None:
     scan = box_scan(np.arange(0, 90, 10), rows=60, sigma_px=0.1)
     print_summary(summarise(scan, replace(head(), covariance=known().table())))

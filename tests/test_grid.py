@@ -255,12 +255,20 @@ def test_free_space_begins_where_the_view_covers_its_share_of_the_band():
     assert found.free_from[0] == pytest.approx(first, abs=1.5 * CELL / 3)
 
 
-def test_a_low_thing_before_a_wall_far_off_is_an_obstacle_of_its_own():
-    """At 5 m the wall's rows scatter by sigma = 0.1 m; a box 0.2 m before it is seen by a third as many rows."""
-    room = ((-1.0, -1.0, 0.0), (5.0, 1.0, 2.6))
-    box = ((4.75, -0.5, 0.0), (5.0, 0.5, 0.55))
-    grid = grid_of(np.arange(-4, 5, 1.0), room=room, boxes=[box], rows=600, noise=1e-3, rng=np.random.default_rng(2))
-    assert at(grid, 4.76, 0.0) == 100
+def test_a_thing_close_before_a_far_wall_is_told_from_the_walls_noise():
+    """At 5 m rows scatter by 25 mm; what 80 mm before the wall is seen by a third as many rows is no part of it."""
+    room, fine = ((-1.0, -1.0, 0.0), (5.0, 1.0, 2.6)), GridParams(resolution_m=0.02)
+    box = ((4.92, -0.5, 0.0), (5.0, 0.5, 0.55))
+    with_box, without = (
+        grid_of(
+            np.arange(-4, 5, 1.0), room=room, boxes=boxes, params=fine,
+            rows=600, noise=1e-3, rng=np.random.default_rng(2),
+        )
+        for boxes in ([box], [])
+    )  # fmt: skip
+    assert at(with_box, 4.925, 0.0) == at(with_box, 5.005, 0.0) == 100
+    assert at(without, 5.005, 0.0) == 100
+    assert (places(without, without.occupied)[:, 0] > 5.0 - 2.5 * 0.025).all()
 
 
 def test_empty_and_hopeless_scans_give_an_unknown_grid():

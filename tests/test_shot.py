@@ -1,0 +1,36 @@
+"""Encoded images opened: whole, cut short and damaged."""
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from scanmap.errors import CameraError
+from scanmap.shot import decode_image, encode_png
+
+
+@pytest.mark.parametrize("grey", [False, True])
+@pytest.mark.parametrize("sampling", ["444", "422", "420"])
+def test_of_a_cut_jpeg_no_row_is_believed_that_the_whole_one_does_not_have(sampling, grey):
+    rng = np.random.default_rng(0)
+    image = (0.2 * rng.integers(0, 255, (240, 320, 3)) + np.linspace(0, 200, 240)[:, None, None]).astype(np.uint8)
+    data = simplejpeg.encode_jpeg(image, 90, "RGB", sampling)
+    whole = decode_image(data, grey=grey)
+    assert whole.rows_valid == 240
+    believed = []
+    for cut in range(900, len(data) - 2, 331):
+        part = decode_image(data[:cut], grey=grey)
+        assert part.image.shape == whole.image.shape
+        np.testing.assert_array_equal(part.image[: part.rows_valid], whole.image[: part.rows_valid])
+        same = (part.image == whole.image).reshape(240, -1).all(axis=1)
+        believed.append((part.rows_valid, 240 if same.all() else int(same.argmin())))
+    # Of what is right no more than two blocks are given up.
+    assert all(right - rows <= 32 for rows, right in believed)
+    assert max(rows for rows, _ in believed) > 180
+
+
+def test_what_is_no_picture_is_refused():
+    png = encode_png(np.arange(12, dtype=np.uint8).reshape(3, 4))
+    np.testing.assert_array_equal(decode_image(png, grey=True).image, np.arange(12).reshape(3, 4))
+    for data in (b"", b"GIF89a", b"\xff\xd8\xff", png[:-4], png[:40] + bytes([png[40] ^ 1]) + png[41:]):
+        with pytest.raises(CameraError, match=f"{len(data)} bytes"):
+            decode_image(data)
