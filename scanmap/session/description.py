@@ -127,7 +127,8 @@ def _describe_pcd(path: Path) -> list[str]:
                 break
     if "POINTS" not in header or "FIELDS" not in header:
         raise RecordingError(f"{path} is not a PCD file: its header lacks POINTS or FIELDS")
-    about = [comment for comment in comments if ": " in comment]
+    # Every bearing by itself is for programs.
+    about = [comment for comment in comments if ": " in comment and not comment.startswith("bearings_rad")]
     return [f"cloud {path}: {header['POINTS']} points, fields {header['FIELDS']}, {header.get('DATA')}", *about]
 
 
