@@ -106,6 +106,16 @@ def test_architecture_page_has_the_same_law() -> None:
     assert written == MAY_IMPORT
 
 
+@pytest.mark.parametrize("room", sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()))
+def test_architecture_page_names_every_file_once(room: str) -> None:
+    page = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    (listed,) = re.findall(rf"^- \*\*{room}\*\* (.*?)\n(?=-|\n)", page, re.MULTILINE | re.DOTALL)
+    named = re.findall(r"`(\w+)`", listed)
+    there = {path.stem for path in (PACKAGE / room).glob("*.py")} - {"__init__"}
+    assert set(named) == there, f"ARCHITECTURE.md, inside the rooms: {sorted(set(named) ^ there)}"
+    assert len(named) == len(there)
+
+
 def test_no_module_with_a_name_that_says_nothing() -> None:
     assert not {path.stem for path in sources()} & FORBIDDEN_NAMES
 
