@@ -24,8 +24,8 @@ import numpy as np
 from scanmap.calibration import Calibration
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
-from scanmap.laserline import find_laser_line
-from scanmap.pipeline import Pipeline, Processes, SecondLook
+from scanmap.laserline import clear_channel, look_at_all
+from scanmap.pipeline import TOGETHER, Pipeline, Processes, SecondLook, checked
 from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
 from scanmap.session.job import finished_scan
@@ -124,15 +124,20 @@ def main() -> None:
             np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
         ),
     }
-    images = [decode_image(jpeg, grey=grey).image for jpeg in jpegs[:4]]
-    lines = [find_laser_line(image, config.laserline, None, pipeline.window) for image in images]
+    images = np.stack([decode_image(jpeg, grey=grey).image for jpeg in jpegs[:TOGETHER]])
+    channel = None if grey else clear_channel(images[0], config.laserline)
+    lines = [look.line for look in look_at_all(images, config.laserline, pipeline.window, channel)]
     parts: dict[str, Callable[[int], object]] = {
         f"{name} to {planes}": lambda k, decode=decode: decode(jpegs[k % DISTINCT]) for name, decode in decoders.items()
     }
-    parts["laser line, with window"] = lambda k: find_laser_line(images[k % 4], config.laserline, None, pipeline.window)
-    parts["triangulation"] = lambda k: triangulate(lines[k % 4], head, config.triangulation)
+    parts["triangulation"] = lambda k: triangulate(lines[k % TOGETHER], head, config.triangulation)
+    for together in (1, TOGETHER):
+        parts[f"laser line, {together} at once"] = lambda k, some=images[:together]: [
+            look_at_all(some, config.laserline, pipeline.window, channel) for _ in range(TOGETHER // len(some))
+        ]
     for name, action in parts.items():
-        print(f"{name:28s} {cpu_ms(action, 40):7.2f} ms CPU a frame")
+        frames_each = TOGETHER if name.startswith("laser") else 1
+        print(f"{name:28s} {cpu_ms(action, 40) / frames_each:7.2f} ms CPU a frame")
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.mcap"
@@ -146,7 +151,7 @@ def main() -> None:
         def replay() -> None:
             with Processes(pipeline) as workers:  # their start counts
                 sinks = [lambda step: scan.add(step.profile, step.shot.bearing), second_look]
-                workers.run(open_source(path).shots(), sinks)
+                workers.run(checked(open_source(path).shots(), pipeline), sinks)
                 worker_mb.extend(peak_mb(pid) for pid in workers.pids)
 
         replaying = spent(replay)

@@ -61,12 +61,13 @@ def image_format(data: bytes) -> str:
     return "png" if data.startswith(PNG_MAGIC) else "unknown"
 
 
-def decode_image(data: bytes, *, grey: bool = False) -> Decoded:
+def decode_image(data: bytes, *, grey: bool = False, into: Image | None = None) -> Decoded:
     """Decode JPEG or PNG bytes.
 
     Args:
         data: encoded image.
         grey: decode to one plane (the JPEG's luminance) instead of BGR.
+        into: where a whole JPEG of that shape is written to, contiguous; the image is this array then.
 
     Raises:
         CameraError: nothing could be decoded.
@@ -76,7 +77,7 @@ def decode_image(data: bytes, *, grey: bool = False) -> Decoded:
     """
     kind = image_format(data)
     if kind == "jpeg":
-        return _decode_jpeg(data, grey)
+        return _decode_jpeg(data, grey, into)
     refusal = f"image cannot be decoded: {len(data)} bytes, neither a whole JPEG nor PNG"
     if not data or (kind == "png" and not _is_whole_png(data)):
         raise CameraError(refusal)
@@ -97,11 +98,14 @@ def encode_png(image: Image) -> bytes:
     return bytes(data)
 
 
-def _decode_jpeg(data: bytes, grey: bool) -> Decoded:
+def _decode_jpeg(data: bytes, grey: bool, into: Image | None) -> Decoded:
     import simplejpeg
 
     colourspace = "GRAY" if grey else "BGR"
     try:
+        if into is not None and simplejpeg.decode_jpeg_header(data)[:2] == into.shape[:2]:
+            simplejpeg.decode_jpeg(data, colorspace=colourspace, buffer=into)
+            return Decoded(into, len(into))
         pixels = simplejpeg.decode_jpeg(data, colorspace=colourspace)
         rows = pixels.shape[0]
     except ValueError as warning:

@@ -134,15 +134,15 @@ def test_cut_jpeg_keeps_the_rows_above_the_cut(pipeline: Pipeline) -> None:
     assert np.abs(step.line.column_px[found] - 120.0).max() < 0.5
 
 
-def test_image_of_another_size_is_refused_before_anything_is_processed(head: Calibration) -> None:
+def test_image_of_another_size_is_refused_before_anything_is_processed(pipeline: Pipeline) -> None:
     other = Shot(0, 0.0, 0.0, 0.0, encode_png(np.zeros((48, 64), np.uint8)))
     with pytest.raises(CalibrationError, match=r"64x48.*320x240"):
-        checked([other], head)
+        checked([other], pipeline)
 
 
-def test_check_looks_past_a_damaged_first_image(head: Calibration) -> None:
+def test_check_looks_past_a_damaged_first_image(pipeline: Pipeline) -> None:
     bad = Shot(0, 0.0, 0.0, 0.0, b"nothing")
-    assert [shot.index for shot in checked([bad, *shots(3)[1:]], head)] == [0, 1, 2]
+    assert [shot.index for shot in checked([bad, *shots(3)[1:]], pipeline)] == [0, 1, 2]
 
 
 def test_image_of_another_size_in_the_middle_costs_only_itself(pipeline: Pipeline) -> None:
@@ -180,6 +180,40 @@ def test_worker_processes_do_not_change_a_bit(pipeline: Pipeline, processes: Pro
         results.append([(*(a.tobytes() for a in (*step.line, *step.profile)), step.fault) for step in steps])
     assert results[0] == results[1] == results[2] == results[3]
     assert "decoded" in results[1][-1][-1]
+
+
+def coloured(column: float, light: tuple[float, float, float]) -> bytes:
+    rng = np.random.default_rng(int(column))
+    line = 180.0 * np.exp(-0.5 * ((np.arange(W) - column) / 1.6) ** 2)
+    image = np.clip(rng.normal(10.0 + line[:, None] * np.array(light), 2.0, (H, W, 3)), 0, 255).astype(np.uint8)
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
+
+
+def test_shots_together_give_what_each_gives_alone(head: Calibration) -> None:
+    """With the laser's channel told by the first picture; one that shows another laser is asked for its own."""
+    red, green = (0.05, 0.1, 1.0), (0.1, 1.0, 0.05)
+    pictures = [coloured(100.0, red), b"nothing", coloured(104.0, red)[:9000], picture(120.0), coloured(110.0, green)]
+    source = [Shot(k, 0.01 * k, 0.01 * k, 0.1 * k, image) for k, image in enumerate(pictures)]
+    pipeline, unasked = (Pipeline(head, LaserLineParams(), TriangulationParams()) for _ in range(2))
+    assert list(checked(source, pipeline)) == source
+    assert pipeline.channel == 2
+    for ask in (pipeline, unasked):
+        for together, shot in zip(ask.process_all(source), source, strict=True):
+            alone = ask.process(shot)
+            assert (together.shot, together.fault) == (alone.shot, alone.fault)
+            for own, same in zip((*alone.line, *alone.profile), (*together.line, *together.profile), strict=True):
+                np.testing.assert_array_equal(own, same)
+    steps = pipeline.process_all(source)
+    assert ["cut" in step.fault for step in steps] == [False, False, True, False, False]
+    for k, column in ((0, 100.0), (3, 120.0), (4, 110.0)):
+        assert np.nanmedian(steps[k].line.column_px) == pytest.approx(column, abs=0.2)
+        assert np.isfinite(steps[k].line.column_px).mean() > 0.98
+
+
+def test_a_picture_that_leaves_doubt_tells_no_channel(head: Calibration) -> None:
+    pipeline = Pipeline(head, LaserLineParams(), TriangulationParams())
+    assert len(list(checked(shots(5), pipeline))) == 5
+    assert pipeline.channel is None
 
 
 def test_what_a_worker_process_raises_is_raised_here(head: Calibration) -> None:

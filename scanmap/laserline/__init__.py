@@ -2,7 +2,7 @@
 
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.grey import binary_image, overlay, to_grey
-from scanmap.laserline.line import find_laser_line, look, look_at_all
+from scanmap.laserline.line import clear_channel, find_laser_line, look, look_at_all
 from scanmap.laserline.params import LaserLineParams, needs_colour
 from scanmap.laserline.result import LaserLine, Look, Reason
 
@@ -13,6 +13,7 @@ __all__ = [
     "Look",
     "Reason",
     "binary_image",
+    "clear_channel",
     "find_laser_line",
     "look",
     "look_at_all",

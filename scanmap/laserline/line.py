@@ -11,6 +11,7 @@ from scanmap.laserline import runs
 from scanmap.laserline.bars import take_bars
 from scanmap.laserline.brightness import by_brightness
 from scanmap.laserline.candidates import BLOCK
+from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import centre_of_gravity, take_cores
 from scanmap.laserline.edges import Edges, across_edges, doubt_of_edges, no_edges, sides_of
@@ -47,6 +48,8 @@ _CORE_SHARE, _CORE_HALF = 0.4, 13
 # By what factor the scatter along a line must exceed the sigmas to be believed, and may fall below them once they are
 # known to be wrong; what is beyond the last is the surface's own.
 _MORE, _LESS, _MOST = 1.08, 0.5, 4.0
+# Share of its rows in which a picture must show the line to be thought of the laser's colour.
+_MOSTLY = 0.5
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
 
@@ -77,26 +80,55 @@ def look(
     background: U8 | None = None,
     window: Array | None = None,
     still: NDArray[np.bool_] | None = None,
+    channel: int | None = None,
 ) -> Look:
     """Locate the laser line as `find_laser_line` does, and all else that looks like one.
 
     Args:
         still: (ceil(H / BLOCK), W) where things of the room are known to be, in blocks of rows; the line is looked
             for everywhere else.
+        channel: the laser's, where other pictures of the scan have told it (see `clear_channel`) and `params` leave
+            it open; a picture in which most rows have no line in it is asked for its own.
     """
     if background is not None:
         background = in_place(image, background)
+    if params.grey != "auto" or image.ndim == 2:
+        channel = None
+    if channel is not None:
+        told = _look(image[None], params, background, window, still, channel)[0]
+        if _mostly_found(told) or (own := channel_of(image, background, params.grey)) == channel:
+            return told
+        return _look(image[None], params, background, window, still, own)[0]
     channel = channel_of(image, background, params.grey)
     return _look(image[None], params, background, window, still, channel)[0]
 
 
-def look_at_all(images: U8, params: LaserLineParams, window: Array | None = None) -> list[Look]:
+def look_at_all(
+    images: U8, params: LaserLineParams, window: Array | None = None, channel: int | None = None
+) -> list[Look]:
     """What `look` gives for each of the pictures (P, H, W) or (P, H, W, 3) of one scan, bit for bit, sooner."""
-    channels = [channel_of(image, None, params.grey) for image in images]
-    if len(set(channels)) == 1:
-        return _look(images, params, None, window, None, channels[0])
-    each = zip(images, channels, strict=True)
-    return [_look(image[None], params, None, window, None, channel)[0] for image, channel in each]
+    told = channel is not None and params.grey == "auto" and images.ndim == 4
+    channels = [channel if told else channel_of(image, None, params.grey) for image in images]
+    if len(set(channels)) > 1:
+        return [look(image, params, None, window, None, channel) for image in images]
+    looks = _look(images, params, None, window, None, channels[0])
+    for k, image in enumerate(images if told else ()):
+        if not _mostly_found(looks[k]):
+            looks[k] = look(image, params, None, window, None, channel)
+    return looks
+
+
+def clear_channel(image: U8, params: LaserLineParams, background: U8 | None = None) -> int | None:
+    """The laser's channel in a picture, where `params` leave it open and the picture leaves no doubt; else None."""
+    if params.grey != "auto" or image.ndim == 2:
+        return None
+    channel, clear = judged_channel(image, background)
+    return channel if clear else None
+
+
+def _mostly_found(look: Look) -> bool:
+    asked = np.count_nonzero(look.line.reason != Reason.WINDOW)
+    return bool(np.count_nonzero(look.line.reason == Reason.OK) >= _MOSTLY * asked)
 
 
 def _look(

@@ -12,9 +12,8 @@ from typing import Protocol
 
 import cv2
 
-from scanmap.calibration import Calibration
 from scanmap.errors import CameraError
-from scanmap.pipeline.step import Sink, Step
+from scanmap.pipeline.step import Pipeline, Sink, Step
 from scanmap.shot import Shot, decode_image
 
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
@@ -26,29 +25,29 @@ class Runner(Protocol):
     def __call__(self, shots: Iterable[Shot], *, sinks: Iterable[Sink], stop: Callable[[], bool]) -> int: ...
 
 
-def checked(shots: Iterable[Shot], calibration: Calibration) -> Iterator[Shot]:
-    """The same shots, after the first readable images were held against the calibration.
+def checked(shots: Iterable[Shot], pipeline: Pipeline) -> Iterator[Shot]:
+    """The same shots, after the first readable images were held against the calibration and told the laser's channel.
 
-    One that fits is enough: a single odd image costs its own shot, not the scan.
+    One that fits is enough: a single odd image costs its own shot, not the scan. So is one that shows the channel.
 
     Raises:
         CalibrationError: the images have another size than the calibration; before anything is processed.
     """
-    source = iter(shots)
+    source, calibration = iter(shots), pipeline.calibration
     seen: list[Shot] = []
     odd: list[tuple[int, int]] = []
+    fitting = 0
     for shot in source:
         seen.append(shot)
         try:
             height, width = decode_image(shot.image, grey=True).image.shape[:2]
         except CameraError:
             continue
-        if (width, height) == (calibration.intrinsics.width, calibration.intrinsics.height):
-            return chain(seen, source)
-        odd.append((width, height))
-        if len(odd) == CHECKED_IMAGES:
+        fits = (width, height) == (calibration.intrinsics.width, calibration.intrinsics.height)
+        odd, fitting = [*odd, *[(width, height)] * (not fits)], fitting + fits
+        if (fits and pipeline.ask_channel(shot)) or CHECKED_IMAGES in (len(odd), fitting):
             break
-    if odd:
+    if odd and not fitting:
         calibration.check_image(*odd[0])
     return chain(seen, source)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +12,17 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
 from scanmap.errors import CameraError
-from scanmap.laserline import LaserLine, LaserLineParams, Reason, look, needs_colour
-from scanmap.shot import Decoded, Shot, decode_image
+from scanmap.laserline import (
+    LaserLine,
+    LaserLineParams,
+    Look,
+    Reason,
+    clear_channel,
+    look,
+    look_at_all,
+    needs_colour,
+)
+from scanmap.shot import Decoded, Image, Shot, decode_image
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
 
 
@@ -29,7 +40,10 @@ Sink = Callable[[Step], None]
 
 
 class Pipeline:
-    """What turns one shot into points; the same object serves every worker, for it changes nothing."""
+    """What turns shots into points; the same object serves every worker, for they change nothing in it.
+
+    The laser's channel is a matter of the scan: `checked` asks the first pictures for it before any is processed.
+    """
 
     def __init__(
         self,
@@ -48,6 +62,7 @@ class Pipeline:
         self.window: NDArray[np.float64] = column_window(calibration, triangulation)
         self.window += np.array([-slack_px, slack_px])
         self.colour = needs_colour(laserline)  # whether the line is found in colour or a grey decode will do
+        self.channel: int | None = None  # the laser's, where a picture has told it beyond doubt
 
     def process(self, shot: Shot, still: NDArray[np.bool_] | None = None) -> Step:
         """Decode, find the line, triangulate. A bad image gives a Step without points and its fault.
@@ -61,16 +76,52 @@ class Pipeline:
         except CameraError as error:
             return self._blind(shot, str(error))
         dark = background.image if background else None
-        line, places = look(image.image, self.laserline, dark, self.window, still)
-        fault = ""
-        rows = min(image.rows_valid, background.rows_valid if background else image.rows_valid)
+        found = look(image.image, self.laserline, dark, self.window, still, self.channel)
+        return self._step(shot, found, min(image.rows_valid, background.rows_valid if background else image.rows_valid))
+
+    def process_all(self, shots: Sequence[Shot]) -> list[Step]:
+        """What `process` gives for each of the shots, bit for bit, sooner."""
+        own = self.calibration.intrinsics
+        if len(shots) == 1 or any(shot.background is not None for shot in shots):
+            return [self.process(shot) for shot in shots]
+        stack = _memory((len(shots), own.height, own.width, 3)[: 4 if self.colour else 3])
+        rows: list[int] = []  # that are whole, of the pictures that can be read
+        faults: dict[int, str] = {}
+        for k, shot in enumerate(shots):
+            own_place = stack[len(rows)]
+            try:
+                image, whole = self._decode(shot.image, own_place)
+            except CameraError as error:
+                faults[k] = str(error)
+                continue
+            if image is not own_place:
+                own_place[:] = image
+            rows.append(whole)
+        looks = look_at_all(stack[: len(rows)], self.laserline, self.window, self.channel) if rows else []
+        seen = zip(looks, rows, strict=True)
+        return [
+            self._blind(shot, faults[k]) if k in faults else self._step(shot, *next(seen))
+            for k, shot in enumerate(shots)
+        ]
+
+    def ask_channel(self, shot: Shot) -> bool:
+        """Let a picture tell the laser's channel; whether it leaves no doubt, or none is needed."""
+        if self.laserline.grey != "auto":
+            return True
+        with suppress(CameraError):
+            background = self._decode(shot.background).image if shot.background is not None else None
+            self.channel = clear_channel(self._decode(shot.image).image, self.laserline, background)
+        return self.channel is not None
+
+    def _step(self, shot: Shot, found: Look, rows: int) -> Step:
+        line, fault = found.line, ""
         if rows < len(line.reason):
             line = _without_rows(line, rows)
             fault = f"image is cut: {rows} of {len(line.reason)} rows are whole"
-        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, places)
+        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
 
-    def _decode(self, data: bytes) -> Decoded:
-        decoded = decode_image(data, grey=not self.colour)
+    def _decode(self, data: bytes, into: Image | None = None) -> Decoded:
+        decoded = decode_image(data, grey=not self.colour, into=into)
         height, width = decoded.image.shape[:2]
         own = self.calibration.intrinsics
         if (width, height) != (own.width, own.height):
@@ -82,6 +133,17 @@ class Pipeline:
         nan = np.full(rows, np.nan)
         line = LaserLine(nan, nan, nan, nan, np.full(rows, Reason.DAMAGED, np.uint8))
         return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault)
+
+
+_own = threading.local()
+
+
+def _memory(shape: tuple[int, ...]) -> Image:
+    """This thread's memory for pictures, the same every time: new memory costs as much as a quarter of decoding."""
+    size = int(np.prod(shape))
+    if getattr(_own, "bytes", None) is None or _own.bytes.size < size:
+        _own.bytes = np.empty(size, np.uint8)
+    return np.asarray(_own.bytes[:size].reshape(shape))
 
 
 def _without_rows(line: LaserLine, first: int) -> LaserLine:

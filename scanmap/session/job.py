@@ -122,7 +122,7 @@ class Job:
             sinks: list[Sink] = [*self._sinks(scan, progress), second_look]
             # Closed here, not when Python gets round to it: the sweep switches the laser off as it ends.
             with noting(self.note), closing(self._recorded()) as shots, self.runner(pipeline) as run_shots:
-                run_shots(checked(shots, self.calibration), sinks=sinks, stop=stop)
+                run_shots(checked(shots, pipeline), sinks=sinks, stop=stop)
             if stop():
                 ended = "interrupted"
         except KeyboardInterrupt:

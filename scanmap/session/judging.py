@@ -56,7 +56,7 @@ def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable
         progress(Progress(done, job.total, float(np.degrees(step.shot.bearing)), found, own.height))
 
     with closing(_closable(job.shots())) as shots, job.runner(pipeline) as run_shots:
-        run_shots(checked(shots, job.calibration), sinks=[keep], stop=stop)
+        run_shots(checked(shots, pipeline), sinks=[keep], stop=stop)
     if stop():
         raise KeyboardInterrupt
     if not done:
