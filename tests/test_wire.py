@@ -12,11 +12,13 @@ from scanmap.rig.grbl import GrblStage
 from scanmap.rig.grbl_link import GrblLink
 from scanmap.rig.grbl_protocol import (
     Dialect,
+    Status,
     dialect_of_build_info,
     parse_banner,
     parse_status,
     real_time_of_build_info,
 )
+from scanmap.rig.grbl_wait import Wait
 from scanmap.rig.manual import ManualStage
 from scanmap.rig.serial_port import SerialPort
 from scanmap.rig.stage import StageParams
@@ -584,6 +586,26 @@ def test_an_open_door_is_said_in_bounded_time(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(StageError, match="is on door: release its hold button or close its door"):
         stage.move_to(math.radians(10))
     finish(port)
+
+
+def test_a_board_that_goes_on_after_its_door_was_closed_is_given_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("scanmap.rig.grbl_wait.time.monotonic", lambda: clock[0])
+    wait = Wait("head", 2.0, 0.25)
+    for after_s, state, substate in (
+        (2.9, "Door", 1),
+        (0.1, "Door", 0),
+        (0.1, "Door", 3),
+        (4.0, "Door", 3),
+        (0.1, "Run", 0),
+    ):
+        clock[0] += after_s
+        status = Status(state, substate, (4.0, 0.0, 0.0), False, None)
+        assert not wait.is_over(status)
+        wait.resume_due(status)
+    clock[0] += 3.1
+    with pytest.raises(StageError, match="runs but stands at 4"):
+        wait.is_over(status)
 
 
 def test_a_restart_whose_banner_got_lost_is_told_by_the_feed_rate_that_is_gone() -> None:

@@ -9,6 +9,7 @@ from scanmap.rig.grbl_protocol import Status
 
 BUSY_STATES = ("Run", "Jog", "Home", "Hold", "Door")  # a board in another state has nothing left to do
 STILL_S = 3.0  # a board that is running but whose position stands this long is stuck; a door may be open as long
+RESTARTING_S = 6.0  # after a door a board stands 4 s, so that its spindle may turn again
 WRITING_S = 0.1  # a board that writes its memory may hear nothing (an AVR 3.4 ms a byte): it is left in peace
 
 
@@ -22,7 +23,7 @@ class Wait:
         self._silence_s = silence_s + peace_s
         self._heard = self._moved = now = time.monotonic()
         self._polled = now + peace_s
-        self._position: tuple[float, ...] | None = None
+        self._seen: tuple[object, ...] = ()  # position and state
         self._unanswered_polls = self._resting_reports = 0
         self._resumed = False
 
@@ -46,20 +47,21 @@ class Wait:
             StageError: the board is held or stuck.
         """
         now = self._heard = time.monotonic()
-        if status.position != self._position:
-            self._position, self._moved = status.position, now
+        if (status.position, status.state, status.substate) != self._seen:
+            self._seen, self._moved = (status.position, status.state, status.substate), now
+        patience_s = RESTARTING_S if (status.state, status.substate) == ("Door", 3) else STILL_S
         if status.state in BUSY_STATES:
             self._resting_reports = 0
         elif self._unanswered_polls:  # a report that the board sends by itself can be older than the line
             self._resting_reports += 1
         self._unanswered_polls = 0
         if status.state in ("Hold", "Door"):
-            if (self._resumed and not status.substate) or now - self._moved > STILL_S:
+            if (self._resumed and not status.substate) or now - self._moved > patience_s:
                 raise StageError(
                     f"stage {self._name} is on {status.state.lower()}: release its hold button or close its door, "
                     "then start again"
                 )
-        elif status.state in ("Run", "Jog") and now - self._moved > STILL_S:
+        elif status.state in ("Run", "Jog") and now - self._moved > patience_s:
             raise StageError(
                 f"stage {self._name} runs but stands at {status.position[0]:g}: check the motor, then home it"
             )

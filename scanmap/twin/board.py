@@ -17,9 +17,9 @@ BANNERS: dict[str, str] = {
     "FluidNC": "Grbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]",
 }
 BUILD_INFO: dict[str, tuple[str, ...]] = {
-    "grbl": ("[VER:1.1h.20190825:]", "[OPT:V,15,128]"),
+    "grbl": ("[VER:1.1h.20190825:{owner}]", "[OPT:V,15,128]"),
     "grblHAL": (
-        "[VER:1.1f.20240812:]",
+        "[VER:1.1f.20240812:{owner}]",
         "[OPT:VNMSL,35,1024,3,0]",
         "[AXS:3:XYZ]",
         "[NEWOPT:ENUMS,RT{legacy},HOME]",
@@ -50,6 +50,7 @@ class Memory:
 
     settings: dict[int, float] = field(default_factory=lambda: dict(_DEFAULTS))
     startup: list[str] = field(default_factory=lambda: ["", ""])
+    owner: str = ""  # what `$I=` has noted
     offsets: dict[str, NDArray[np.float64]] = field(
         default_factory=lambda: {f"G{number}": np.zeros(3) for number in range(54, 60)}
     )
@@ -61,6 +62,16 @@ class Memory:
             f"${number}=" + decimal(value, 3 if number in _THREE_DECIMALS else 0)
             for number, value in sorted(self.settings.items())
         ]
+
+    def restore(self, what: str, dialect: DialectName) -> None:
+        """`$RST=`: `$` the settings, `#` the offsets, `*` everything."""
+        fresh = Memory()
+        if what in "$*":
+            self.settings = fresh.settings | (OF_GRBLHAL if dialect == "grblHAL" else {})
+        if what in "#*":
+            self.offsets = fresh.offsets
+        if what == "*":
+            self.startup, self.owner = fresh.startup, fresh.owner
 
     def store(self, number: int, value: float, dialect: DialectName = "grbl") -> int:
         """Write a setting; returns grbl's error number, 0 if it was taken."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanmap.twin.board import Modes, triple
 from scanmap.twin.gcode import GcodeError, Words, read_words
+from scanmap.twin.overrides import Overrides
 from scanmap.twin.spindle import Spindle
 from scanmap.twin.system_commands import Answer, SystemCommands, Wait
 
@@ -31,6 +32,7 @@ class Executor:
     def __init__(self, board: Firmware) -> None:
         self._board = board
         self.modes = Modes()
+        self.overrides = Overrides()
         self.spindle = Spindle(board)
         self._position = board.planner.position()  # where the parser believes to stand, not rounded to steps
         self.probed, self.probe_closed = np.zeros(3), False
@@ -85,6 +87,8 @@ class Executor:
                 raise GcodeError(31)
             if moves and motion != "G0" and not feed:
                 raise GcodeError(22)
+            if moves and motion == "G38.2" and np.array_equal(self._target(words), self._position):
+                raise GcodeError(33)
         except GcodeError as error:
             return error.code
         self.modes.feed = feed
@@ -105,8 +109,14 @@ class Executor:
         self.modes.codes["motion"] = motion
         if moves:
             yield from self._move(words, motion, feed)
+        if words.codes.get("stopping") == "M0" and not self._board.checking:
+            yield from self.synchronise()
+            self._board.planner.hold(self._board.present)
+            while self._board.planner.held:
+                yield math.inf
         if words.codes.get("stopping") in ("M2", "M30"):
             yield from self.synchronise()
+            self.overrides = Overrides()
             self.spindle.stand("M5", 0.0, motion)
             self._board.tell_offset()
             resting = Modes()
@@ -197,6 +207,12 @@ class Executor:
     def _share(self, motion: str) -> float:
         return self.spindle.share_of_move(self.modes.codes["spindle"], self.modes.speed, motion)
 
+    def toggle_coolant(self) -> None:
+        """As M8 or M9 would, but at once."""
+        if self._board.present_state in ("Idle", "Run", "Hold"):
+            self.modes.codes["coolant"] = "M9" if self.modes.codes["coolant"] == "M8" else "M8"
+            self._board.tell_overrides()
+
     def follow_moves(self) -> None:
         """Moves have begun or ended: the laser goes with them."""
         self.spindle.follow(self._board.planner.take_power(), self.modes.codes["spindle"], self.modes.speed)
@@ -215,7 +231,10 @@ class Executor:
         along = np.maximum(way / length, 1e-12)
         fastest = float(np.min([settings[110 + axis] / along[axis] for axis in range(3)]))
         acceleration = float(np.min([settings[120 + axis] / along[axis] for axis in range(3)]))
-        speed = max(min(feed or fastest, fastest), SLOWEST_FEED) / 60
+        wanted = fastest * self.overrides.rapid / 100 if feed is None else feed
+        if feed is not None and not is_jog:
+            wanted *= self.overrides.feed / 100
+        speed = max(min(wanted, fastest), SLOWEST_FEED) / 60
         board.planner.add(target, speed, acceleration, board.present, is_jog=is_jog, power=share)
 
     def jog(self, text: str) -> Answer:

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from scanmap.twin.board import ALARM_S, EEPROM_BYTE_S, HOMING, HOMING_FIRST, OF_GRBLHAL, DialectName, Memory
 from scanmap.twin.main_loop import MainLoop
 from scanmap.twin.motion import Drivetrain
+from scanmap.twin.overrides import Door, obey
 from scanmap.twin.planner import Planner
-from scanmap.twin.receiver import UART_BYTES
+from scanmap.twin.receiver import UART_BYTES, real_time
 from scanmap.twin.serial_line import Faults, SerialLine
 from scanmap.twin.status_report import status_line
 
-_LEGACY = {ord("?"): 0x80, ord("~"): 0x81, ord("!"): 0x82}  # real-time commands and grblHAL's other names of them
 _CRITICAL_ALARMS = {1, 2}  # these halt the board until it is reset
 _DEAD_STOPS = {1, 3}  # in mid-way: these let the motor go even where $1 is 255
 
@@ -217,6 +217,7 @@ class Firmware:
         self._busy_until = self._deaf_until = -math.inf
         self._halted = self._halting = self._reset_wanted = self._status_wanted = False
         self.asleep = self.homing = self.checking = self.restart_requested = False
+        self.door = Door(self)
         self.loop = MainLoop(self)
         self._wake = math.inf
         self.go_idle()
@@ -231,7 +232,7 @@ class Firmware:
             self.loop.executor.follow_moves()
             if was_cancelling and not self.planner.cancelling:
                 self.loop.executor.synchronise_position()
-            self._wake = self._compute()
+            self._wake = min(self._compute(), self.door.advance())
             if self.planner.moving:
                 self._motor_on = True
             elif was_moving:
@@ -266,24 +267,18 @@ class Firmware:
             if len(self._uart) < UART_BYTES:
                 self._uart.append(byte)
             return
-        command = byte
-        if self.dialect == "grblHAL" and not (self.loop.receiver.keeps_text and not self.memory.settings[39]):
-            command = _LEGACY.get(byte, byte)
-        elif self.dialect != "grblHAL":
-            command = _LEGACY.get(byte, 0xFF if byte in _LEGACY.values() else byte)
+        in_text = self.loop.receiver.keeps_text and not self.memory.settings.get(39)
+        command = real_time(byte, self.dialect, in_text=in_text)
         if command == 0x18:
             self._soft_reset()
         elif command == 0x80:
             self._want_status()
         elif command == 0x82:
             self._hold()
-        elif command == 0x81:
-            if not self.homing:
-                self.planner.resume(self._now)
-        elif command == 0x85 and self.planner.jogging:
-            self.planner.cancel(self._now)
         elif command < 0x80:
             self.loop.receiver.add(byte)
+        else:
+            obey(self, command)
 
     def _soft_reset(self) -> None:
         if self._reset_wanted:
@@ -296,18 +291,21 @@ class Firmware:
         self._reset_wanted = True
 
     def _hold(self) -> None:
-        if self.alarm or self.asleep or self.checking or self.homing:
+        if self.alarm or self.asleep or self.checking or self.homing or self.door.is_open:
             return
-        if self.planner.jogging:
-            self.planner.cancel(self._now)
-        else:
-            self.planner.hold(self._now)
+        brake = self.planner.cancel if self.planner.jogging else self.planner.hold
+        brake(self._now)
 
     @property
     def present_state(self) -> str:
         """The state as it stands, for the code that runs on the board."""
         flags = {"Sleep": self.asleep, "Alarm": self.alarm, "Home": self.homing, "Check": self.checking}
-        flags |= {"Hold": self.planner.held, "Jog": self.planner.jogging, "Run": self.planner.busy}
+        flags |= {
+            "Door": self.door.is_open,
+            "Hold": self.planner.held,
+            "Jog": self.planner.jogging,
+            "Run": self.planner.busy,
+        }
         return next((name for name, is_so in flags.items() if is_so), "Idle")
 
     def _want_status(self) -> None:

@@ -29,6 +29,7 @@ MODAL_GROUPS: dict[str, tuple[str, ...]] = {
 }
 _GROUP_OF = {code: group for group, codes in MODAL_GROUPS.items() for code in codes}
 _WITH_AXES = {"G10", "G92"}
+MOST_LINES, MOST_TOOLS, PLACES = 9_999_999, 255, 6  # N, T, and P of G10
 _VALUE_LETTERS = "FILNPRSTXYZJK"
 
 
@@ -95,16 +96,24 @@ def read_words(line: str) -> Words:
 def _checked(words: Words) -> Words:
     if any(words.values.get(letter, 0.0) < 0 for letter in "FNSTP"):
         raise GcodeError(4)
+    if words.values.get("N", 0.0) > MOST_LINES:
+        raise GcodeError(27)
+    if words.values.get("T", 0.0) > MOST_TOOLS:
+        raise GcodeError(38)
     nonmodal = words.codes.get("nonmodal")
     motion = words.codes.get("motion")
     if nonmodal in _WITH_AXES and motion and motion != "G80":
         raise GcodeError(24)
     if nonmodal == "G4" and "P" not in words.values:
         raise GcodeError(28)
-    if nonmodal == "G10" and not {"P", "L"} <= set(words.values):
-        raise GcodeError(28)
     if nonmodal in _WITH_AXES and not words.axes:
         raise GcodeError(26)
+    if nonmodal == "G10" and not {"P", "L"} <= set(words.values):
+        raise GcodeError(28)
+    if nonmodal == "G10" and words.values["P"] > PLACES:
+        raise GcodeError(29)
+    if nonmodal == "G10" and words.values["L"] not in (2, 20):
+        raise GcodeError(20)
     if motion and motion.startswith("G38") and not words.axes:
         raise GcodeError(26)
     used = {"F", "S", "T", "N", "X", "Y", "Z"}

@@ -11,6 +11,20 @@ LINE_CHARACTERS = {"grbl": 79, "grblHAL": 255, "FluidNC": 255}
 UART_BYTES = 2  # what the serial port itself holds while the processor does not look
 
 
+_LEGACY = {ord("?"): 0x80, ord("~"): 0x81, ord("!"): 0x82}  # real-time commands and grblHAL's other names of them
+
+
+def real_time(byte: int, dialect: DialectName, *, in_text: bool) -> int:
+    """The real-time command that a byte is, by grblHAL's names; 0xFF for one that this board does not know.
+
+    Args:
+        in_text: it belongs to a `$` line of a grblHAL that takes no legacy commands there.
+    """
+    if dialect == "grblHAL":
+        return byte if in_text else _LEGACY.get(byte, byte)
+    return _LEGACY.get(byte, 0xFF if byte in _LEGACY.values() else byte)
+
+
 class Receiver:
     """Bytes from the host; those that are real-time commands never come here."""
 

@@ -61,6 +61,7 @@ class Spindle:
 
     def _share_of(self, speed: float) -> float:
         most, least = self._range()
+        speed *= self._board.loop.executor.overrides.spindle / 100
         if least >= most or speed >= most:
             return 1.0
         if speed <= least:
@@ -69,6 +70,7 @@ class Spindle:
 
     def _limited(self, speed: float) -> float:
         most, least = self._range()
+        speed *= self._board.loop.executor.overrides.spindle / 100
         return most if least >= most else min(max(speed, least), most)
 
     def _range(self) -> tuple[float, float]:

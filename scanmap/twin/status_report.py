@@ -42,18 +42,19 @@ class StatusReport(NamedTuple):
     """What a board knows when it is asked `?`."""
 
     state: str
-    braking: bool  # a hold has not come to rest yet
+    substate: int | None  # of a hold or a door
     position: NDArray[np.float64]  # machine position [units]
     offset: NDArray[np.float64]  # work zero seen from machine zero [units]
     speed: float  # [units/s]
     spindle_speed: float  # [units of S]
+    overrides: str  # feed, rapids, spindle [%]
     accessories: str  # S, C, F: what is switched on
     pins: str  # X, P: what is pressed
     free: tuple[int, int]  # blocks of the planner, bytes of the receive buffer
 
     def line(self, mask: int, *, in_inches: bool, with_offset: bool, with_overrides: bool) -> str:
         """As `$10` (grblHAL's, a superset of grbl's) and `$13` want it."""
-        fields = [f"{self.state}:{int(self.braking)}" if self.state == "Hold" else self.state]
+        fields = [self.state if self.substate is None else f"{self.state}:{self.substate}"]
         place = self.position - (0 if mask & 1 else self.offset)
         fields.append(("MPos:" if mask & 1 else "WPos:") + triple(place, in_inches))
         if mask & 2:
@@ -66,7 +67,7 @@ class StatusReport(NamedTuple):
         if with_offset and mask & 32:
             fields.append("WCO:" + triple(self.offset, in_inches))
         if with_overrides and mask & 64:
-            fields.append("Ov:100,100,100" + (f"|A:{self.accessories}" if self.accessories else ""))
+            fields.append(f"Ov:{self.overrides}" + (f"|A:{self.accessories}" if self.accessories else ""))
         return f"<{'|'.join(fields)}>"
 
 
@@ -76,11 +77,12 @@ def status_line(board: Firmware) -> str:
     with_offset, with_overrides = board.loop.rare.due(state)
     report = StatusReport(
         state=state,
-        braking=board.planner.moving,
+        substate={"Hold": int(board.planner.moving), "Door": board.door.substate}.get(state),
         position=board.planner.position(),
         offset=executor.work_offset(),
         speed=board.planner.speed(board.present),
         spindle_speed=executor.spindle.speed,
+        overrides=executor.overrides.words,
         accessories=executor.spindle.accessories() + "F" * (executor.modes.codes["coolant"] == "M8"),
         pins=_pins(board),
         free=(board.planner.free_blocks, board.loop.receiver.free),

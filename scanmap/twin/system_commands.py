@@ -89,7 +89,10 @@ class SystemCommands:
         """Commands that need a board at rest."""
         board, memory = self._board, self._board.memory
         reports = {
-            "I": [line.format(legacy="+" if memory.settings.get(39) else "-") for line in BUILD_INFO[board.dialect]],
+            "I": [
+                line.format(legacy="+" if memory.settings.get(39) else "-", owner=memory.owner)
+                for line in BUILD_INFO[board.dialect]
+            ],
             "N": [f"$N{number}={line}" for number, line in enumerate(memory.startup)],
             "#": self._parameters(),
         }
@@ -108,6 +111,14 @@ class SystemCommands:
             board.checking = not board.checking
             board.message("Enabled" if board.checking else "Disabled")
             board.restart_requested = not board.checking
+        elif command.startswith("I=") and board.dialect != "FluidNC":
+            memory.owner = command[2:]
+            board.write_memory(len(memory.owner) + 2)
+        elif command in ("RST=$", "RST=#", "RST=*") and board.dialect != "FluidNC":
+            memory.restore(command[-1], board.dialect)
+            self._executor.apply_steps()
+            board.message("Restoring defaults")
+            board.restart_requested = True
         else:
             return self._fluidnc(command) if board.dialect == "FluidNC" else self._store(command)
         return 0
