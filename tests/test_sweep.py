@@ -232,18 +232,18 @@ def test_adaptive_sweep_visits_what_the_picture_asks_for(rig: Rig, firmware: Fir
     coarse = plan(SweepParams(step_deg=10)).bearings
     asked: list[int] = []
 
-    def refine() -> np.ndarray:
+    def refine(shots: int) -> np.ndarray:
         gaps = np.zeros(18, bool)
         gaps[[3, 4]] = True
-        asked.append(1)
-        return between(coarse, gaps, 2.5)
+        asked.append(shots)
+        return [between(coarse, gaps, 2.5), np.radians([36.0, 34.0]), np.empty(0)][len(asked) - 1]
 
     params = SweepParams(step_deg=10, mode="adaptive")
     shots = list(sweep(rig, params, sleep=firmware.wait, refine=refine))
     fine = [math.degrees(shot.bearing) for shot in shots[19:]]
-    assert fine == pytest.approx([47.5, 45, 42.5, 37.5, 35, 32.5], abs=1 / 80)
-    assert [shot.index for shot in shots] == list(range(25))
-    assert asked == [1]
+    assert fine == pytest.approx([47.5, 45, 42.5, 37.5, 35, 32.5, 34, 36], abs=1 / 80)  # down, then up again
+    assert [shot.index for shot in shots] == list(range(27))
+    assert asked == [19, 25, 27]
 
 
 @given(n=st.integers(2, 40), fine=st.floats(0.05, 5), mask=st.integers(0, 2**39 - 1))

@@ -21,7 +21,7 @@ JUMP_SHARE = 0.03  # of a gap's rows that lie on two surfaces: a table leg seen 
 
 
 class Refinement:
-    """Collects the first pass of an adaptive sweep as it is processed, and asks for what lies between.
+    """Collects the shots of an adaptive sweep as they are processed, and asks for what lies between.
 
     `hand_out` counts the shots, `collecting` keeps what was made of them, in whatever thread; `bearings` waits until
     both are even.
@@ -57,7 +57,7 @@ class Refinement:
         return kept
 
     def bearings(self, count: int) -> NDArray[np.float64]:
-        """Further bearings [rad] after a first pass of `count` shots."""
+        """Further bearings [rad] after the first `count` shots; none where these will do."""
         with self._changed:
             self._changed.wait_for(lambda: self._processed >= self._handed_out)
         scan = Scan(self._calibration.mount, self._calibration.intrinsics.height)
@@ -68,26 +68,29 @@ class Refinement:
 
 
 def further_bearings(scan: Scan, config: Config) -> NDArray[np.float64]:
-    """Bearings [rad] between those of a coarse scan (B, H) whose bearings ascend.
+    """Bearings [rad] between those of a scan (B, H) so far whose bearings ascend.
 
-    A gap with a jump in range is filled in steps of `sweep.fine_deg`; one before far walls as finely as makes
-    neighbouring points `sweep.spacing_m` apart, but no finer than that.
+    A gap with a jump in range is halved, again and again until the edge is known to `sweep.fine_deg`: that takes three
+    shots where filling a gap of eight fine steps takes seven. A gap before far walls is filled at once, so that
+    neighbouring points are `sweep.spacing_m` apart, but no finer than `sweep.fine_deg`.
     """
     if len(scan) < 2:
         return np.empty(0)
-    step_deg = np.minimum(_step_for_jumps(scan, config), _step_for_distance(scan, config.sweep))
     gaps_deg = np.degrees(np.diff(scan.bearings))
-    return between(scan.bearings, step_deg < gaps_deg - 1e-6, np.maximum(step_deg, config.sweep.fine_deg))
+    halves_deg = np.where(_jumps(scan, config), gaps_deg / 2, np.inf)
+    finest_deg = gaps_deg / np.maximum(np.floor(gaps_deg / config.sweep.fine_deg + 1e-6), 1.0)
+    step_deg = np.maximum(np.minimum(halves_deg, _step_for_distance(scan, config.sweep)), finest_deg)
+    return between(scan.bearings, step_deg < gaps_deg - 1e-6, step_deg)
 
 
-def _step_for_jumps(scan: Scan, config: Config) -> NDArray[np.float64]:
-    """(B - 1,) step that each gap wants [deg]; infinity where the room is smooth."""
+def _jumps(scan: Scan, config: Config) -> NDArray[np.bool_]:
+    """(B - 1,) whether the range jumps in a gap."""
     linked = bearing_links(disparity(scan, config.scan, 0), slice(None), depth_edge_slope(config.scan))
     both = scan.valid[:-1] & scan.valid[1:]
     jumps = (both & ~linked).sum(axis=1) > JUMP_SHARE * scan.rows
     # A surface that ends where nothing returns, at a window or a door, is an edge as well.
     ends = np.abs(np.diff(scan.valid.sum(axis=1))) > 0.1 * scan.rows
-    return np.where(jumps | ends, config.sweep.fine_deg, np.inf)
+    return np.asarray(jumps | ends)
 
 
 def _step_for_distance(scan: Scan, params: SweepParams) -> NDArray[np.float64]:

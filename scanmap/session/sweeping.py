@@ -59,7 +59,7 @@ class Sweeping:
             self._config.sweep,
             sleep=opened.sleep,
             clock=opened.clock,
-            refine=None if refinement is None else lambda: refinement.bearings(len(self._planned.bearings)),
+            refine=None if refinement is None else refinement.bearings,
             watch=self._watch if self._config.sweep.watch else None,
             done=earlier.done if earlier is not None else (),
             note=self.note,

@@ -22,7 +22,7 @@ STILL_RAD = math.radians(0.01)  # a head that stands is reported at one place
 
 logger = logging.getLogger(__name__)
 
-Refine = Callable[[], NDArray[np.float64]]  # further bearings [rad], asked for after an adaptive sweep's first pass
+Refine = Callable[[int], NDArray[np.float64]]  # further bearings [rad] of an adaptive sweep, after so many shots
 
 
 @runtime_checkable
@@ -57,17 +57,17 @@ class Steps:
         self._exposure_us: float | None = None  # as last asked for
 
     def shots(self, stop: Callable[[], bool], refine: Refine | None, done: Collection[int]) -> Iterator[Shot]:
-        """Every shot of the plan but those `done`; then what `refine` asks for, on the way back.
+        """Every shot of the plan but those `done`; then what `refine` asks for, to and fro, until it asks for no more.
 
         A shot that was withdrawn comes again under its index.
         """
         bearings = self._planned.bearings
         yield from self._visit(map(Place, range(len(bearings)), bearings.tolist()), stop, done)
-        if self._params.mode == "adaptive" and refine is not None and not stop():
-            further = np.sort(refine())
-            on_the_way_back = further if bearings[-1] < bearings[0] else further[::-1]
-            places = map(Place, range(len(bearings), len(bearings) + len(further)), on_the_way_back.tolist())
-            yield from self._visit(places, stop, done)
+        count, upward = len(bearings), bearings[-1] < bearings[0]
+        while self._params.mode == "adaptive" and refine is not None and not stop() and len(further := refine(count)):
+            on_the_way = np.sort(further)[:: 1 if upward else -1]
+            yield from self._visit(map(Place, range(count, count + len(further)), on_the_way.tolist()), stop, done)
+            count, upward = count + len(further), not upward
         while not stop():
             self._proof.look_back()
             again = self._proof.take_again()

@@ -55,7 +55,7 @@ def sweep(
         stop: asked before each bearing; True ends the sweep in order.
         sleep: waits for the head to settle; a twin in fast-forward passes time by its own clock.
         clock: the clock that frames are stamped with [s]; continuous sweeps ask the stage by it.
-        refine: adaptive sweeps ask it for further bearings after the first pass.
+        refine: adaptive sweeps ask it for further bearings after each pass, until it has none.
         watch: holds the pictures against each other, to notice lost steps, a stalled motor and a dead laser.
         done: indices of shots that an interrupted sweep took already.
         note: told of every fault that was overcome: a retry, a homing.
