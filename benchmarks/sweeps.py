@@ -3,8 +3,8 @@
     python benchmarks/sweeps.py [--width 640] [adaptive] [bracket]
 
 Points that the laser lights and the camera sees, every half degree (for brackets: at the bearings of the scan), are the
-truth; one is measured where a point of the cloud is near. Edges are where the range jumps from one half degree to the next, far is the farthest quarter, dark are
-things that throw back less than a twentieth of the light.
+truth; one is measured where a point of the cloud is near. Edges are where the range jumps from one half degree to the
+next, far is the farthest quarter, dark are things that throw back less than a twentieth of the light.
 """
 
 from __future__ import annotations
