@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -73,8 +74,10 @@ class TwinScan:
         self.cloud, self.map = folder / "room.ply", folder / "room.yaml"
         self.recording = folder / "room.mcap"
         outputs = session.Outputs((self.cloud,), self.map, self.recording)
-        with session.prepare_scan(session.Choice(None, (*SMALL, *settings)), outputs, view=False) as job:
-            self.job = job
+        with pytest.MonkeyPatch.context() as patch, ExitStack() as opened:
+            patch.setattr("scanmap.session.rigs.build_scene", baked_scene)
+            choice = session.Choice(None, (*SMALL, *settings))
+            job = self.job = opened.enter_context(session.prepare_scan(choice, outputs, view=False))
             self.result = job.run(lambda _: None, lambda: False)
             self.truth = job.truth
 

@@ -82,7 +82,7 @@ def test_floor_of_a_coarse_noisy_scan_is_not_a_layer_of_furniture(tmp_path: Path
     The floor comes out 1.5 cm high there, at 0.983 to 0.986 m for six seeds of the noise, and says sigma = 9 mm itself:
     3 cm are three of them. The furniture is decimetres off.
     """
-    small = ("calibration.image.width=640", "calibration.image.height=480", "sweep.step_deg=3.0")
+    small = ("calibration.image.width=640", "calibration.image.height=480", "sweep.step_deg=3.0", "sweep.watch=false")
     grid = TwinScan(tmp_path, *small, "twin.sensor.jpeg_quality=80").result.grid
     assert grid is not None and grid.floor is not None
     assert grid.floor.how == "fitted"
@@ -134,7 +134,7 @@ def corner(a: PlaneFit, b: PlaneFit) -> np.ndarray:
 
 def test_box_has_its_true_area(tmp_path: Path) -> None:
     """Every wall flat and in its place, and the polygon of the fitted walls as large as the room."""
-    once_round = ("stage.max_deg=360", "sweep.end_deg=354", "sweep.step_deg=6.0")
+    once_round = ("stage.max_deg=360", "sweep.end_deg=351", "sweep.step_deg=9.0", "sweep.watch=false")
     scanned = TwinScan(tmp_path, "twin.room=box", *once_round)
     truth = scanned.truth
     assert truth is not None
