@@ -543,6 +543,7 @@ def test_signal_in_mid_scan_keeps_everything(run: Run, tmp_path: Path, number: s
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130 and not err
     assert "stopping: the head parks" in out and "interrupted after " in out
+    assert "next: scanmap scan --resume a.mcap --out a.ply" in out
     assert {"a.ply", "a.yaml", "a.pgm", "a.rrd", "a.mcap"} == {path.name for path in tmp_path.iterdir()}
     assert "ended: interrupted" in run("info", recording).out
     assert run("replay", recording, "--out", "again.ply").code == 0

@@ -76,6 +76,19 @@ def test_two_parts_equal_one_scan_bit_for_bit(tmp_path: Path, settings: tuple[st
     assert 0 < info.duration_s < describe(whole).duration_s + 10  # the time between the parts does not count
 
 
+def test_what_to_do_next_is_said_of_the_whole_scan_not_of_its_last_part(tmp_path: Path) -> None:
+    first, said = tmp_path / "a.mcap", []
+    for begun, shots in ((None, 3), (first, 5), (first, 1000)):
+        outputs = session.Outputs((tmp_path / "a.ply",), record=None if begun else first)
+        choice = session.Choice(None if begun else "twin-quick", () if begun else QUICK)
+        with session.prepare_scan(choice, outputs, view=False, resume=begun) as job:
+            said.append(job.run(lambda _: None, lambda job=job, shots=shots: job.done + 1 >= shots).next_commands)
+    assert (tmp_path / "a.part3.mcap").exists()
+    assert said[0] == said[1] and said[0][1:] == said[2]
+    assert said[0][0] == f"scanmap scan --resume {first} --out {tmp_path / 'a.ply'}"
+    assert all(str(first) in command and "part" not in command for command in said[2])
+
+
 def test_shots_lost_to_damage_are_taken_again(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
     scan(tmp_path / "whole")

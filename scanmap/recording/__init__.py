@@ -4,7 +4,7 @@ from scanmap.recording.info import RecordingInfo, TopicInfo, describe
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_writer import Recorder, whole_ns
 from scanmap.recording.opening import open_source
-from scanmap.recording.parts import is_later_part, next_part, part_path
+from scanmap.recording.parts import first_part, is_later_part, next_part, part_path
 from scanmap.recording.recovery import recover
 from scanmap.recording.source import Source
 
@@ -15,6 +15,7 @@ __all__ = [
     "Source",
     "TopicInfo",
     "describe",
+    "first_part",
     "is_later_part",
     "next_part",
     "open_source",

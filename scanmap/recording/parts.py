@@ -23,6 +23,11 @@ def is_later_part(path: Path) -> bool:
     return path.suffix == ".mcap" and _PART.search(path.stem) is not None
 
 
+def first_part(path: Path) -> Path:
+    """The file in which the scan begins that `path` is a part of: the one that stands for all of it."""
+    return path.with_name(f"{_PART.sub('', path.stem)}.mcap") if is_later_part(path) else path
+
+
 def next_part(path: Path) -> Path:
     """A new file for the next part of the scan that begins in `path`."""
     return next(part for part in (part_path(path, number) for number in count(2)) if not part.exists())

@@ -19,7 +19,7 @@ from scanmap.errors import RecordingError, ScanmapError
 from scanmap.grid import OccupancyGrid
 from scanmap.laserline import Reason
 from scanmap.pipeline import Pipeline, Processes, Runner, SecondLook, Sink, Step, checked, run, worth_processes
-from scanmap.recording import Recorder
+from scanmap.recording import Recorder, first_part
 from scanmap.scan import Scan
 from scanmap.scan.surface import remove_outliers
 from scanmap.session.noting import noting
@@ -248,7 +248,7 @@ class Job:
             files=files,
             unwritten=unwritten,
             truth=self.truth.compare(clean.points[clean.valid], clean.bearings) if self.truth is not None else None,
-            next_commands=self._next_commands(files),
+            next_commands=self._next_commands(files, ended),
         )
 
     def _close_view(
@@ -287,12 +287,14 @@ class Job:
             f"{self.config.laserline.min_peak:g} low enough?"
         )
 
-    def _next_commands(self, files: list[Path]) -> list[str]:
+    def _next_commands(self, files: list[Path], ended: str) -> list[str]:
         if self.recorder is not None:
-            path = shlex.quote(str(self.recorder.path))
-            rrd = shlex.quote(str(self.recorder.path.with_name(f"{self.recorder.path.stem}.rrd")))
+            recording = first_part(self.recorder.path)  # a part by itself is not the scan
+            path, rrd = (shlex.quote(str(file)) for file in (recording, recording.with_suffix(".rrd")))
             look = path if has_display() else f"{path} --save {rrd}"
-            return [f"scanmap view {look}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
+            cloud = "".join(f" --out {shlex.quote(str(file))}" for file in self.outputs.clouds[:1])
+            go_on = [f"scanmap scan --resume {path}{cloud}"] if ended != "finished" else []
+            return [*go_on, f"scanmap view {look}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
         clouds = [shlex.quote(str(path)) for path in files if path in self.outputs.clouds and is_scan_file(path)]
         maps = [shlex.quote(str(path)) for path in files if path == self.outputs.map]
         commands = [f"scanmap info {path}" for path in (*clouds[:1], *maps)]
