@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from synthetic_lines import HARD, RED, LineSpec, clean, hard_frame
 
-from scanmap.laserline import LaserLineParams, look, look_at_all
+from scanmap.laserline import LaserLineParams, look, look_at_all, rounding_of
 
 POOLED = LaserLineParams(pool_rows=9)
 ODD = [  # next to each other lines of all kinds: saturated, dim, thin, wide, speckled, stepped, none
@@ -19,9 +19,10 @@ ODD = [  # next to each other lines of all kinds: saturated, dim, thin, wide, sp
 ]
 
 
-def assert_as_alone(pictures, params=POOLED, window=None):
-    for picture, together in zip(pictures, look_at_all(np.stack(pictures), params, window), strict=True):
-        alone = look(picture, params, None, window)
+def assert_as_alone(pictures, params=POOLED, window=None, roundings=None):
+    found = look_at_all(np.stack(pictures), params, window, roundings=roundings)
+    for picture, rounding, together in zip(pictures, roundings or [None] * len(found), found, strict=True):
+        alone = look(picture, params, None, window, rounding=rounding)
         for name, own, same in zip(alone.line._fields, alone.line, together.line, strict=True):
             np.testing.assert_array_equal(own, same, err_msg=name)
         np.testing.assert_array_equal(alone.places, together.places)
@@ -47,12 +48,14 @@ def test_large_pictures_compressed_by_a_camera(height):
     rng = np.random.default_rng(1)
     window = np.tile([20.0, 600.0], (height, 1))
     window[:100] = np.nan
-    pictures = []
+    pictures, roundings = [], []
     for k, spec in enumerate(ODD[:6]):
         picture, _ = clean(LineSpec(**{**vars(spec), "height": height, "width": 640, "colour": RED}), rng)
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80 + 3 * k])[1]
         pictures.append(np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), np.uint8))
+        roundings.append(rounding_of(jpeg.tobytes()) if k % 3 else None)
     assert_as_alone(pictures, POOLED, window)
+    assert_as_alone(pictures, POOLED, window, roundings)
 
 
 @pytest.mark.parametrize("method", ["cog", "brightest"])

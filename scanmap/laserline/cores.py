@@ -103,6 +103,6 @@ def _borne_out(column: Array, row: Index, sigma: F32, width: F32, pictures: int)
         return sigma.astype(np.float64)
     columns, sigmas = np.full((2, pictures, len(column) // pictures), np.nan)
     columns.reshape(-1)[row], sigmas.reshape(-1)[row] = column[row], sigma
-    factor = np.minimum(unexplained(columns, sigmas, segments(columns, sigmas)[0], APART_ROWS), 1.0)
+    factor = np.fmin(unexplained(columns, sigmas, segments(columns, sigmas)[0], APART_ROWS), 1.0)
     least = np.minimum(_CORE_BIAS * width, sigma)
     return np.asarray(np.maximum(factor[row // columns.shape[1]] * sigma, least), np.float64)

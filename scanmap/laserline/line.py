@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,8 @@ from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import centre_of_gravity, take_cores
-from scanmap.laserline.edges import Edges, across_edges, doubt_of_edges, no_edges, sides_of
+from scanmap.laserline.edges import across_edges, doubt_of_edges, sides_of
+from scanmap.laserline.error_bars import Doubts, no_doubts, with_error_bars
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
 from scanmap.laserline.offframe import standing_out
@@ -22,8 +24,8 @@ from scanmap.laserline.offmatch import in_place
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
-from scanmap.laserline.pooling import APART_ROWS, pool, segments, unexplained
 from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
+from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import Course, search
 from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
@@ -45,9 +47,6 @@ _WEAK_PX, _STANDS_OUT = 0.2, (2.5, 4.5)
 _BLOCKS_ROWS = 18
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
-# By what factor the scatter along a line must exceed the sigmas to be believed, and may fall below them once they are
-# known to be wrong; what is beyond the last is the surface's own.
-_MORE, _LESS, _MOST = 1.08, 0.5, 4.0
 # Share of its rows in which a picture must show the line to be thought of the laser's colour.
 _MOSTLY = 0.5
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
@@ -59,6 +58,7 @@ def find_laser_line(
     params: LaserLineParams,
     background: U8 | None = None,
     window: Array | None = None,
+    rounding: Rounding | None = None,
 ) -> LaserLine:
     """Locate the laser line.
 
@@ -67,11 +67,12 @@ def find_laser_line(
         params: how.
         background: the same view with the laser off, or None.
         window: (H, 2) first and last column a return can have, from the calibration; NaN = none in this row.
+        rounding: of the file that the picture was, as `rounding_of` reads it.
 
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
     """
-    return look(image, params, background, window).line
+    return look(image, params, background, window, rounding=rounding).line
 
 
 def look(
@@ -81,6 +82,7 @@ def look(
     window: Array | None = None,
     still: NDArray[np.bool_] | None = None,
     channel: int | None = None,
+    rounding: Rounding | None = None,
 ) -> Look:
     """Locate the laser line as `find_laser_line` does, and all else that looks like one.
 
@@ -89,32 +91,39 @@ def look(
             for everywhere else.
         channel: the laser's, where other pictures of the scan have told it (see `clear_channel`) and `params` leave
             it open; a picture in which most rows have no line in it is asked for its own.
+        rounding: of the file that the picture was, as `rounding_of` reads it.
     """
     if background is not None:
         background = in_place(image, background)
     if params.grey != "auto" or image.ndim == 2:
         channel = None
     if channel is not None:
-        told = _look(image[None], params, background, window, still, channel)[0]
+        told = _look(image[None], params, background, window, still, channel, [rounding])[0]
         if _mostly_found(told) or (own := channel_of(image, background, params.grey)) == channel:
             return told
-        return _look(image[None], params, background, window, still, own)[0]
+        return _look(image[None], params, background, window, still, own, [rounding])[0]
     channel = channel_of(image, background, params.grey)
-    return _look(image[None], params, background, window, still, channel)[0]
+    return _look(image[None], params, background, window, still, channel, [rounding])[0]
 
 
 def look_at_all(
-    images: U8, params: LaserLineParams, window: Array | None = None, channel: int | None = None
+    images: U8,
+    params: LaserLineParams,
+    window: Array | None = None,
+    channel: int | None = None,
+    roundings: Sequence[Rounding | None] | None = None,
 ) -> list[Look]:
     """What `look` gives for each of the pictures (P, H, W) or (P, H, W, 3) of one scan, bit for bit, sooner."""
     told = channel is not None and params.grey == "auto" and images.ndim == 4
     channels = [channel if told else channel_of(image, None, params.grey) for image in images]
+    roundings = [None] * len(images) if roundings is None else roundings
     if len(set(channels)) > 1:
-        return [look(image, params, None, window, None, channel) for image in images]
-    looks = _look(images, params, None, window, None, channels[0])
+        each = zip(images, roundings, strict=True)
+        return [look(image, params, None, window, None, channel, rounding) for image, rounding in each]
+    looks = _look(images, params, None, window, None, channels[0], roundings)
     for k, image in enumerate(images if told else ()):
         if not _mostly_found(looks[k]):
-            looks[k] = look(image, params, None, window, None, channel)
+            looks[k] = look(image, params, None, window, None, channel, roundings[k])
     return looks
 
 
@@ -138,6 +147,7 @@ def _look(
     window: Array | None,
     still: NDArray[np.bool_] | None,
     channel: int | None,
+    roundings: Sequence[Rounding | None],
 ) -> list[Look]:
     """Look at pictures (P, H, W, ...) whose line is looked for in one channel."""
     pictures, height, width = images.shape[:3]
@@ -157,7 +167,7 @@ def _look(
     background = None if background is None else background[:, left : left + image.shape[1]]
     still = None if still is None else still[:, left : left + image.shape[1]]
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
-    sight = sight_of(image, background, how, height, channel)
+    sight = sight_of(image, background, how, height, channel, roundings)
     course = search(sight, window - left, params.min_snr, still)
     lines = _found(sight, course, params, windows - left)
     lines.column_px[:] += left
@@ -175,7 +185,7 @@ def _each(lines: LaserLine, height: int) -> list[LaserLine]:
 def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:
     noise, height = sight.noise, sight.height
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
-    line, edges = _located(sight, (row, column), params)
+    line, doubts = _located(sight, (row, column), params)
     take_bars(line, sight, params)
     line = _within(line, window)
     wide = runs.blobs(line.column_px, line.width_px, line.peak, line.sigma_px, noise)
@@ -201,39 +211,17 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array)
         line = without(line, runs.crumbs(line.column_px, disturbed, height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
         weak |= disturbed
     line = without(line, runs.crumbs(line.column_px, weak, height), Reason.AMBIGUOUS)
-    line.column_px[:] += edges.shift
-    line = _pooled(line, params.pool_rows, height)
-    return line._replace(sigma_px=np.hypot(line.sigma_px, edges.doubt))
+    line.column_px[:] += doubts.edges.shift
+    return with_error_bars(line, sight, params.pool_rows, doubts)
 
 
-def _pooled(line: LaserLine, rows: int, height: int) -> LaserLine:
-    """The lines with sigmas that the scatter along them bears out, and pooled over so many rows (3 or more)."""
-    column, sigma = line.column_px.reshape(-1, height), line.sigma_px.reshape(-1, height)
-    parts = segments(column, sigma)
-    more = np.minimum(unexplained(column, sigma, parts[0], APART_ROWS), _MOST)
-    correlated = more > _MORE
-    if correlated.any():
-        sigma *= np.where(correlated, more, 1.0)[:, None]
-        parts = segments(column, sigma)
-    if rows >= 3:
-        column, sigma = pool(column, sigma, rows, parts)
-        # Errors that are alike in neighbouring rows do not average out as others do.
-        more = unexplained(column, sigma, parts[0], (rows + 1,))
-        differ = correlated | (more > _MORE)
-        sigma *= np.where(differ, np.minimum(np.maximum(more, _LESS), _MOST), 1.0)[:, None]
-    return line._replace(column_px=column.ravel(), sigma_px=sigma.ravel())
-
-
-def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> tuple[LaserLine, Edges]:
-    """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows.
-
-    And what edges of the room's brightness do to its columns (H,), which is no matter of whether they are the line's.
-    """
+def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> tuple[LaserLine, Doubts]:
+    """The line at integer columns (N,) of rows (N,), fitted, judged, spread over all H rows; and its doubts."""
     line = no_line(len(sight.lit), Reason.WEAK)
-    edges = no_edges(len(sight.lit))
+    doubts = no_doubts(len(sight.lit))
     row, column = at
     if not row.size:
-        return line, edges
+        return line, doubts
     around = samples_of(sight, row, column)
     # Speckle is one for a picture; the largest group, which comes first, tells it best.
     contrast = {"auto": np.nan, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
@@ -272,10 +260,11 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         line.width_px[at_good] = peaks.width_px[k]
         line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px[k], peaks.bias_px[k]), _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
-        edges.shift[at_good], edges.doubt[at_good] = own.shift[k], own.doubt[k]
+        doubts.edges.shift[at_good], doubts.edges.doubt[at_good] = own.shift[k], own.doubt[k]
+        doubts.plain[at_good] = peaks.bias_px[k] == 0.0
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]
-    return line, edges
+    return line, doubts
 
 
 def _judged(peaks: Peaks, noise: F32, params: LaserLineParams) -> NDArray[np.uint8]:

@@ -22,6 +22,7 @@ _BEND_DOUBT, _BEND_ROWS, _BEND_LEAST = 2.0, 129, 0.3
 # Rows apart in which a JPEG's errors are not the same: its blocks have eight.
 APART_ROWS = (5, 6)
 TELLING = 75  # rows that tell whether sigma is too small
+_LEAN_ROWS = 16  # on either side, that tell how a line leans
 
 
 def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] | None = None) -> tuple[Array, Array]:
@@ -56,7 +57,7 @@ def pool(column: Array, sigma: Array, support: int, parts: tuple[Index, Index] |
 
 
 def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]) -> Array:
-    """How much more (or less) lines scatter than their sigmas say: a factor (P,) for each; 1 where too few rows tell.
+    """How much more (or less) lines scatter than their sigmas say: a factor (P,) for each; NaN where too few rows tell.
 
     Args:
         column: (P, H) of P pictures, NaN where a row has no line.
@@ -68,27 +69,65 @@ def unexplained(column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
     Other rows can: fourth differences of a line are zero on every surface bent no more than a cubic, and 70 variances
     of noise. The median of all rows counts, so that edges do not.
     """
+    told = _fourth_differences(column, sigma, start, lags)
+    return np.array([_typical([ratio for _, ratio in one]) for one in told])
+
+
+def unexplained_by_height(column: Array, sigma: Array, start: Index, lags: tuple[int, ...], height: Array) -> Array:
+    """`unexplained` (P, H) for the rows of each octave of `height` (P, H) by themselves, as far as enough of them tell.
+
+    A bright line is no Gaussian after a camera's tone curve, which its own residuals take for noise; a dim one is.
+    """
+    factor = np.full(column.shape, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        octave = np.rint(np.log2(height))
+    for k, told in enumerate(_fourth_differences(column, sigma, start, lags)):
+        factor[k] = of_all = _typical([ratio for _, ratio in told])
+        octaves = np.unique(octave[k][np.isfinite(column[k])])
+        for one in octaves if np.isfinite(of_all) and len(octaves) > 1 else ():
+            some = [ratio[octave[k][at] == one] for at, ratio in told]
+            own, count = _typical(some), min(map(len, some))
+            if np.isfinite(own):
+                factor[k, octave[k] == one] = of_all * (own / of_all) ** (count / (count + TELLING))
+    return factor
+
+
+def moved(column: Array, parts: tuple[Index, Index], lag: Array) -> Array:
+    """Columns (P, H) that lines move on by in `lag` (P,) rows [px], as they lean around each of their rows."""
+    row = np.arange(column.size)
+    first, last = np.maximum(row - _LEAN_ROWS, parts[0]), np.minimum(row + _LEAN_ROWS, parts[1] - 1)
+    flat = column.ravel()
+    by: Array = ((flat[last] - flat[first]) / np.maximum(last - first, 1)).reshape(column.shape) * lag[:, None]
+    return by
+
+
+def _typical(told: list[Array]) -> float:
+    """Standard deviation of values whose squares are given, some for each lag, by their medians; NaN of too few."""
+    if min(map(len, told)) < TELLING:
+        return float("nan")
+    medians = [float(np.partition(ratio, len(ratio) // 2)[len(ratio) // 2]) for ratio in told]
+    return float(np.sqrt(sum(medians) / len(medians) / 0.455))  # the median of chi^2 with one degree of freedom
+
+
+def _fourth_differences(
+    column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
+) -> list[list[tuple[Index, Array]]]:
+    """For each picture and lag: middle rows of every other fourth difference, its square over what sigmas expect."""
     pictures, height = column.shape
-    if height <= 4 * max(lags):
-        return np.ones(pictures)
     column, variance = column.ravel(), np.square(sigma).ravel()
-    told, squares = np.ones(pictures, bool), np.zeros(pictures)
+    told: list[list[tuple[Index, Array]]] = [[] for _ in range(pictures)]
     for lag in lags:
         span = 4 * lag
-        at = ((start[:-span] == start[span:]) & np.isfinite(column[:-span])).nonzero()[0]
-        rows = len(column) - span
+        rows = max(len(column) - span, 0)
+        at = ((start[:rows] == start[len(start) - rows :]) & np.isfinite(column[:rows])).nonzero()[0]
         a, b, c, d, e = (column[k : k + rows] for k in range(0, span + 1, lag))
         va, vb, vc, vd, ve = (variance[k : k + rows] for k in range(0, span + 1, lag))
         step = a + e - 4.0 * (b + d) + 6.0 * c
         ratio = step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc)
         for k, own in enumerate(by_picture(at // height, pictures)):
-            some = ratio[at[own][::2]]
-            told[k] &= len(some) >= TELLING
-            if told[k]:
-                middle = len(some) // 2
-                some.partition(middle)
-                squares[k] += some[middle] / 0.455  # the median of chi^2 with one degree of freedom
-    return np.where(told, np.sqrt(squares / len(lags)), 1.0)
+            some = at[own][::2]
+            told[k].append((some + (2 * lag - k * height), ratio[some]))
+    return told
 
 
 def segments(column: Array, sigma: Array) -> tuple[Index, Index]:

@@ -12,7 +12,8 @@ from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.grey import NEIGHBOUR
 from scanmap.laserline.path import strips
 from scanmap.laserline.pictures import Rows, not_one
-from scanmap.laserline.sight import Sight
+from scanmap.laserline.rounding import LIGHT
+from scanmap.laserline.sight import BRIGHTNESS, Sight
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -23,12 +24,6 @@ REACH = 24  # [px] samples on either side of the column
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
 _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
-# Share of a channel (blue, green, red) in what it and its neighbour have of brightness (BT.601's weights).
-_BRIGHTNESS = (0.16, 0.66, 0.34)
-# How far the mixture goes from there to the laser's own channel, at the least, and for each grey level of noise: more
-# averages noise, less the errors that all rows of an upright line share. All the way where colour is stored finely.
-_COLOUR, _COLOUR_PER_NOISE = 0.1, 0.3
-_LIGHT = 0.12  # share of the laser's light that a neighbouring channel sees
 
 
 class Samples(NamedTuple):
@@ -67,7 +62,7 @@ class Samples(NamedTuple):
         usable = beside < SATURATED
         if self.outside is not None:
             usable &= ~_some(self.outside[span], some)
-        share = np.float32(_BRIGHTNESS[self.channel])
+        share = np.float32(BRIGHTNESS[self.channel])
         brightness: F32 = own * share
         brightness += beside * (np.float32(1.0) - share)
         return brightness, usable.astype(np.float32)
@@ -82,7 +77,8 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     """The samples around integer columns (N,) of rows (N,)."""
     lit, seen = sight.lit, sight.plane
     beside = outside = None
-    if sight.image is not None and (sight.colour < 1.0).any():
+    smeared = np.array([mixture.channel >= 0 for mixture in sight.mixtures])
+    if sight.image is not None and smeared.any():
         across = strips(sight.image, row, column, REACH)
         y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
     else:
@@ -91,27 +87,17 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
-    brightness = _BRIGHTNESS[sight.channel]
-    coarse = np.minimum(_COLOUR + _COLOUR_PER_NOISE * sight.noise, 1.0)
-    colour = sight.colour + (1.0 - sight.colour) * coarse
-    share = (brightness + colour * (1.0 - brightness)).astype(np.float32)
+    share = np.array([mixture.share for mixture in sight.mixtures], np.float32)
     rows = Rows(row // sight.height, sight.noise)
-    return Samples(
-        y, bright, beside, outside, rows, sight.channel, (sight.colour < 1.0)[rows.picture], share[rows.picture]
-    )
+    return Samples(y, bright, beside, outside, rows, sight.channel, smeared[rows.picture], share[rows.picture])
 
 
 def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: F32) -> F32:
-    """The laser's channel with the neighbouring one in it (n, N), as high as the laser's own; whole lines only.
-
-    Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
-    colour, which is smeared. Two channels together hold more of the one and less of the other. What JPEG rounds of
-    colour moves all rows of an upright line alike, which no pooling takes out.
-    """
+    """The laser's channel with the neighbouring one in it (n, N), as high as the laser's own; whole lines only."""
     rest = np.float32(1.0) - share
     mixed = own * share
     mixed += beside * rest
-    mixed *= np.float32(1.0) / (share + rest * np.float32(_LIGHT))
+    mixed *= np.float32(1.0) / (share + rest * np.float32(LIGHT))
     cut = (usable.min(axis=0) < 1).nonzero()[0]
     mixed[:, cut] = own.take(cut, axis=1)
     return mixed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -14,6 +14,7 @@ from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
 from scanmap.laserline.offmatch import at_exposure
+from scanmap.laserline.rounding import Mixture, Rounding, best_mixture
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
@@ -23,6 +24,12 @@ ONE_FOR_ALL = -1  # the channel of a colour picture without colour
 # Noise of the difference of two channels over that of one, from which on they are independent; below, in grey levels,
 # no difference is measured.
 _INDEPENDENT, _NONE = 1.2, 0.3
+# Share of a channel (blue, green, red) in what it and its neighbour have of brightness (BT.601's weights).
+BRIGHTNESS = (0.16, 0.66, 0.34)
+_BAND_PX = 3  # columns in a group that is compared with the next
+# How far the mixture goes from there to the laser's own channel where the file does not say what was rounded, at the
+# least, and for each grey level of noise: more averages noise, less the errors that all rows of an upright line share.
+_COLOUR, _COLOUR_PER_NOISE = 0.1, 0.3
 
 
 class Conversion(NamedTuple):
@@ -46,7 +53,8 @@ class Sight(NamedTuple):
     image_rows: U8 | None  # (P ceil(B / 2), W, 3) of image
     channel: int  # of the image; -1 without one
     noise: F64  # (P,) of a sample of lit [grey levels]
-    colour: F64  # (P,) how finely it is stored: 0 where the channels' noise is one, 1 where they are independent
+    mixtures: Sequence[Mixture]  # (P,) of the image's channels that the line is placed in
+    roundings: Sequence[Rounding | None]  # (P,) of the files that the pictures were
     gain: float = 1.0  # that the laser-off frame's exposure is matched by
 
     @property
@@ -62,11 +70,24 @@ class Sight(NamedTuple):
             assert on is not None and plane is not None and lit is not None
             one = slice(k, k + 1)
             yield self._replace(
-                on=on, plane=plane, lit=lit, image=image, noise=self.noise[one], colour=self.colour[one]
+                on=on,
+                plane=plane,
+                lit=lit,
+                image=image,
+                noise=self.noise[one],
+                mixtures=self.mixtures[one],
+                roundings=self.roundings[one],
             )
 
 
-def sight_of(image: U8, background: U8 | None, how: Conversion, height: int, channel: int | None) -> Sight:
+def sight_of(
+    image: U8,
+    background: U8 | None,
+    how: Conversion,
+    height: int,
+    channel: int | None,
+    roundings: Sequence[Rounding | None],
+) -> Sight:
     """Look at pictures.
 
     Args:
@@ -74,6 +95,7 @@ def sight_of(image: U8, background: U8 | None, how: Conversion, height: int, cha
         background: the laser-off frame of the same view, moved onto a single picture; or None.
         how: colour becomes one plane.
         channel: as `channel_of` has it.
+        roundings: (P,) of the files that the pictures were.
     """
     if channel == ONE_FOR_ALL:
         channel, image, background = None, image[..., 1], None if background is None else background[..., 1]
@@ -84,9 +106,10 @@ def sight_of(image: U8, background: U8 | None, how: Conversion, height: int, cha
         rows = np.asarray(cv2.extractChannel(seen, channel), np.uint8)
         # Most of a large picture is never looked at.
         plane = image[..., channel] if large else extract(image, channel)
-        colour = [_fineness(image[k : k + height], channel) for k in pictures]
         noise = _noises(plane, rows, height)
-        return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, np.array(colour))
+        each = zip(pictures, noise, roundings, strict=True)
+        mixtures = [_mixture(image[k : k + height], channel, own, rounding) for k, own, rounding in each]
+        return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off, gain = None, 1.0
     if background is not None:
@@ -94,7 +117,8 @@ def sight_of(image: U8, background: U8 | None, how: Conversion, height: int, cha
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
     rows = np.concatenate([quick_rows(lit[k : k + height]) for k in pictures])
     noise = _noises(lit, rows, height)
-    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, np.ones(len(noise)), gain)
+    mixtures = [Mixture(-1 if channel is None else channel)] * len(noise)
+    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain)
 
 
 def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
@@ -123,13 +147,35 @@ def _noises(plane: U8, rows: U8, height: int) -> F64:
     return np.array([noise_of(plane[k : k + height]) for k in range(0, len(plane), height)])
 
 
-def _fineness(image: U8, channel: int) -> float:
-    """How much of the noise of colour is there: less than 1 after JPEG, or after a camera's own matrix.
+def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -> Mixture:
+    """What of a picture's channels the line is placed in.
 
-    Independent noises differ by more than each, by the root of two; what JPEG stores of colour, at fewer columns and
-    coarser steps, differs by less the coarser it is.
+    Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
+    colour, which is smeared. Two channels together hold more of the one and less of the other. Where the file does not
+    tell what was rounded, the noise does: independent noises differ by more than each, by the root of two; what is
+    stored at fewer columns and coarser steps differs by less the coarser it is.
     """
+    if rounding is not None and rounding.colour is not None:
+        return best_mixture(rounding, channel, _noise_in_band(image, channel))
     rows = np.ascontiguousarray(image[:: max(1, len(image) // 8), ::2])
     own, other = (np.asarray(cv2.extractChannel(rows, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
     difference = noise_of(np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8))
-    return min(difference / (_INDEPENDENT * noise_of(other)), 1.0) if difference > _NONE else 0.0
+    fine = difference / (_INDEPENDENT * noise_of(other)) if difference > _NONE else 0.0
+    if fine >= 1.0:
+        return Mixture(-1)
+    colour = fine + (1.0 - fine) * min(_COLOUR + _COLOUR_PER_NOISE * noise, 1.0)
+    return Mixture(channel, BRIGHTNESS[channel] + colour * (1.0 - BRIGHTNESS[channel]))
+
+
+def _noise_in_band(image: U8, channel: int) -> tuple[float, float, float]:
+    """Noise of a channel, its neighbour and their difference, at the frequencies of a line, as a sample's would be.
+
+    Compression takes the noise between one column and the next, which moves no line, and leaves more of that between
+    groups of columns, which does.
+    """
+    rows = np.ascontiguousarray(image[:: max(1, len(image) // 8)])
+    means = cv2.resize(rows, (max(rows.shape[1] // _BAND_PX, 1), len(rows)), interpolation=cv2.INTER_AREA)
+    own, other = (np.asarray(cv2.extractChannel(means, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
+    difference = np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8)
+    first, second, both = (round(float(np.sqrt(_BAND_PX)) * noise_of(plane), 1) for plane in (own, other, difference))
+    return first, second, both

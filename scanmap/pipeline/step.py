@@ -17,10 +17,12 @@ from scanmap.laserline import (
     LaserLineParams,
     Look,
     Reason,
+    Rounding,
     clear_channel,
     look,
     look_at_all,
     needs_colour,
+    rounding_of,
 )
 from scanmap.shot import Decoded, Image, Shot, decode_image
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
@@ -76,7 +78,8 @@ class Pipeline:
         except CameraError as error:
             return self._blind(shot, str(error))
         dark = background.image if background else None
-        found = look(image.image, self.laserline, dark, self.window, still, self.channel)
+        rounding = rounding_of(shot.image)
+        found = look(image.image, self.laserline, dark, self.window, still, self.channel, rounding)
         return self._step(shot, found, min(image.rows_valid, background.rows_valid if background else image.rows_valid))
 
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
@@ -86,6 +89,7 @@ class Pipeline:
             return [self.process(shot) for shot in shots]
         stack = _memory((len(shots), own.height, own.width, 3)[: 4 if self.colour else 3])
         rows: list[int] = []  # that are whole, of the pictures that can be read
+        roundings: list[Rounding | None] = []
         faults: dict[int, str] = {}
         for k, shot in enumerate(shots):
             own_place = stack[len(rows)]
@@ -97,7 +101,9 @@ class Pipeline:
             if image is not own_place:
                 own_place[:] = image
             rows.append(whole)
-        looks = look_at_all(stack[: len(rows)], self.laserline, self.window, self.channel) if rows else []
+            roundings.append(rounding_of(shot.image))
+        seen_by = self.laserline, self.window, self.channel, roundings
+        looks = look_at_all(stack[: len(rows)], *seen_by) if rows else []
         seen = zip(looks, rows, strict=True)
         return [
             self._blind(shot, faults[k]) if k in faults else self._step(shot, *next(seen))
