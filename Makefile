@@ -47,6 +47,7 @@ bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/recording.py
 	$(BIN)/python benchmarks/twin.py
 	$(BIN)/python benchmarks/hard_sweep.py
+	$(BIN)/python benchmarks/sweeps.py
 
 lock:
 	uv lock
