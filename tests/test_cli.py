@@ -545,7 +545,8 @@ def test_signal_in_mid_scan_keeps_everything(run: Run, tmp_path: Path, number: s
     assert "stopping: the head parks" in out and "interrupted after " in out
     assert "next: scanmap scan --resume a.mcap --out a.ply" in out
     assert {"a.ply", "a.yaml", "a.pgm", "a.rrd", "a.mcap"} == {path.name for path in tmp_path.iterdir()}
-    assert "ended: interrupted" in run("info", recording).out
+    about = run("info", recording).out
+    assert "ended: interrupted" in about and about.endswith(f"next: scanmap scan --resume {recording}\n")
     assert run("replay", recording, "--out", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
 

@@ -40,7 +40,15 @@ def describe(path: Path) -> list[str]:
     if path.suffix.lower() in (".pgm", ".png", ".jpg", ".jpeg"):
         raise ConfigError(f"{path} is an image; of a map name the .yaml beside it. scanmap info wants {KINDS}")
     reader = _READERS.get(path.suffix.lower()) if path.is_file() else None
-    return reader(path) if reader is not None else recording.describe(path).lines
+    return reader(path) if reader is not None else _describe_recording(path)
+
+
+def _describe_recording(path: Path) -> list[str]:
+    info = recording.describe(path)
+    unfinished = info.cut_at is not None or info.end_reason != "finished"
+    if not (unfinished and info.has_rig and path.suffix == ".mcap"):
+        return info.lines
+    return [*info.lines, f"next: scanmap scan --resume {shlex.quote(str(recording.first_part(path)))}"]
 
 
 def _describe_ply(path: Path) -> list[str]:
