@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,10 @@ from scanmap.geometry import inverse, transform
 from scanmap.shot import Image
 from scanmap.view import entities as at
 from scanmap.view.pictures import jpeg
-from scanmap.view.scene import laser_fan
+from scanmap.view.scene import HALF_PIXEL, laser_fan
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 Array = NDArray[np.float64]
 
@@ -54,22 +58,9 @@ def write_boards(
         recording.save(path, default_blueprint=rrb.Blueprint(_layout(calibration, poses), collapse_panels=True))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written ({error.strerror}); choose another path for --rrd") from error
-    own = calibration.intrinsics
     recording.log("head", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    T = calibration.T_head_camera
-    recording.log("head/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]), static=True)
-    recording.log(
-        "head/camera/image",
-        rr.Pinhole(
-            image_from_camera=own.matrix, resolution=[own.width, own.height], image_plane_distance=0.15,
-            camera_xyz=rr.ViewCoordinates.RDF,
-        ),
-        static=True,
-    )  # fmt: skip
-    for _, picture in pictures[:1]:
-        sent = jpeg(picture, 80)
-        recording.log("head/camera/image", rr.EncodedImage(contents=sent.data, media_type=sent.media_type), static=True)
-    quads = [transform(T @ pose, np.vstack([outline, outline[:1]])) for pose in poses]
+    _log_camera(recording, calibration, [picture for _, picture in pictures[:1]])
+    quads = [transform(calibration.T_head_camera @ pose, np.vstack([outline, outline[:1]])) for pose in poses]
     recording.log(
         "head/boards", rr.LineStrips3D(quads, colors=[120, 160, 120], radii=rr.Radius.ui_points(1.0)), static=True
     )
@@ -83,21 +74,39 @@ def write_boards(
             static=True,
         )
     if points:
-        cloud, off = transform(T, np.concatenate(list(points))), np.concatenate(list(off_m))
-        colours = colours_by_distance(off, float(np.percentile(np.abs(off), 95)))
-        recording.log(
-            "head/laser",
-            rr.Points3D(cloud, colors=colours, radii=rr.Radius.ui_points(1.5)),
-            static=True,
-        )
-        fan = laser_fan(calibration, 1.1 * float(np.linalg.norm(cloud, axis=1).max()))
-        recording.log(
-            "head/plane",
-            rr.Mesh3D(vertex_positions=fan.vertices, triangle_indices=fan.triangles, albedo_factor=[255, 30, 30, 40]),
-            static=True,
-        )
+        _log_laser(recording, calibration, np.concatenate(list(points)), np.concatenate(list(off_m)))
     recording.flush()
     recording.disconnect()
+
+
+def _log_camera(recording: rr.RecordingStream, calibration: Calibration, pictures: Sequence[Image]) -> None:
+    """The camera where it stands in the head, with what it saw."""
+    import rerun as rr
+
+    own, T = calibration.intrinsics, calibration.T_head_camera
+    recording.log("head/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]), static=True)
+    pinhole = rr.Pinhole(
+        image_from_camera=own.matrix + HALF_PIXEL, resolution=[own.width, own.height], image_plane_distance=0.15,
+        camera_xyz=rr.ViewCoordinates.RDF,
+    )  # fmt: skip
+    recording.log("head/camera/image", pinhole, static=True)
+    for picture in pictures:
+        sent = jpeg(picture, 80)
+        recording.log("head/camera/image", rr.EncodedImage(contents=sent.data, media_type=sent.media_type), static=True)
+
+
+def _log_laser(recording: rr.RecordingStream, calibration: Calibration, points: Array, off_m: Array) -> None:
+    """The laser's points (N, 3) [m] of the camera frame by their distances (N,) from the plane, and the plane."""
+    import rerun as rr
+
+    cloud = transform(calibration.T_head_camera, points)
+    colours = colours_by_distance(off_m, float(np.percentile(np.abs(off_m), 95)))
+    recording.log("head/laser", rr.Points3D(cloud, colors=colours, radii=rr.Radius.ui_points(1.5)), static=True)
+    fan = laser_fan(calibration, 1.1 * float(np.linalg.norm(cloud, axis=1).max()))
+    plane = rr.Mesh3D(
+        vertex_positions=fan.vertices, triangle_indices=fan.triangles, albedo_factor=[255, 30, 30, 40]
+    )  # fmt: skip
+    recording.log("head/plane", plane, static=True)
 
 
 def colours_by_distance(off: Array, limit: float) -> NDArray[np.uint8]:

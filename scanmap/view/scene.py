@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
 
+# The viewer counts a pixel's centre as 0.5; its pinhole knows no distortion. To be added to a camera matrix.
+HALF_PIXEL: Array = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+
 LASER_RED = (255, 45, 45, 255)
 FAN_RED = (255, 30, 30, 70)
 
@@ -74,9 +77,8 @@ def log_scene(recording: rr.RecordingStream, calibration: Calibration, params: V
     T = calibration.T_head_camera
     recording.log(at.CAMERA, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]), static=True)
     own = calibration.intrinsics
-    # The viewer counts a pixel's centre as 0.5; its pinhole knows no distortion.
     factor = shrink_factor(own.width, params.image_width_px)
-    K = own.matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    K = own.matrix + HALF_PIXEL
     K[:2] /= factor
     recording.log(
         at.IMAGE,
