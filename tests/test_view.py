@@ -35,6 +35,7 @@ from scanmap.triangulation import (
 from scanmap.view import View, ViewParams, open_view, show, viewer
 from scanmap.view import entities as at
 from scanmap.view.blueprint import eye_over
+from scanmap.view.boards import write_boards
 from scanmap.view.pictures import jpeg, shrink_factor, shrunk, shrunk_lines
 from scanmap.view.scene import height_colours, laser_fan
 from scanmap.view.thesis_view import painted
@@ -647,3 +648,26 @@ def test_each_tab_can_be_drawn(tmp_path: Path, tab: str) -> None:
     assert picture is not None
     assert picture.shape == (800, 1200, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
+
+
+def test_boards_in_space_stand_where_they_were(tmp_path: Path) -> None:
+    own, T = HEAD.intrinsics, HEAD.T_head_camera
+    outline = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.2, 0.0], [0.0, 0.2, 0.0]])
+    pose = np.eye(4)
+    pose[:3, 3] = -0.1, -0.05, 0.6
+    laser = np.array([[-0.02, 0.01 * k, 0.6] for k in range(5)])
+    off = np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
+    picture = np.full((own.height, own.width, 3), 90, np.uint8)
+    write_boards(tmp_path / "b.rrd", HEAD, outline, [pose], [laser], [off], [("one", picture)])
+    made = Recorded(tmp_path / "b.rrd")
+    np.testing.assert_allclose(made.matrix("head/camera", None), T, atol=1e-6)
+    K = np.reshape(made.rows("head/camera/image", "Pinhole:image_from_camera", static=True)[None], (3, 3)).T
+    np.testing.assert_allclose(K, own.matrix + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), rtol=1e-6)
+    strip = np.reshape(made.rows("head/boards", "LineStrips3D:strips", static=True)[None][0], (5, 3))
+    np.testing.assert_allclose(strip[:4], (outline + pose[:3, 3]) @ T[:3, :3].T + T[:3, 3], atol=1e-6)
+    points = np.reshape(made.rows("head/laser", "Points3D:positions", static=True)[None], (-1, 3))
+    np.testing.assert_allclose(points, laser @ T[:3, :3].T + T[:3, 3], atol=1e-6)
+    colours = [c >> 8 for c in made.rows("head/laser", "Points3D:colors", static=True)[None]]
+    assert colours[0] == 0x0072B2 and colours[2] == 0xD2D2D2 and colours[4] == 0xD55E00  # nearer, on it, farther
+    assert made.rows("head/axis", "LineStrips3D:strips", static=True)
+    assert made.rows("head/plane", "Mesh3D:vertex_positions", static=True)

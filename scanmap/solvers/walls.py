@@ -49,7 +49,7 @@ class Wall:
     range_m: float  # median
     rms_m: float
     rms_limit_m: float
-    bow_m: float  # height of the arc along its length, signed toward the scanner
+    bow_m: float  # height of the arc along its length; positive if its ends come toward the scanner
     bow_limit_m: float
 
     @property
