@@ -218,10 +218,17 @@ def test_a_line_damaged_on_its_way_is_sent_again_and_a_wrong_place_is_noticed() 
     finish(port)
 
 
-def test_a_head_that_never_arrives_is_an_error_with_both_places() -> None:
-    stage, port = play([*OPEN_GRBL, *move(10, reported=4), *move(10, reported=4)])
-    with pytest.raises(StageError, match="asked for 10 deg and stands at 4"):
+@pytest.mark.parametrize("there", [4, 9.975], ids=["far off", "two steps off"])
+def test_a_head_that_never_arrives_is_an_error_with_both_places(there: float) -> None:
+    stage, port = play([*OPEN_GRBL, *move(10, reported=there), *move(10, reported=there)])
+    with pytest.raises(StageError, match=f"asked for 10 deg and stands at {there:g}"):
         stage.move_to(math.radians(10))
+    finish(port)
+
+
+def test_a_head_one_step_off_has_arrived() -> None:
+    stage, port = play([*OPEN_GRBL, *move(10, reported=9.988)])  # a step is 1 / 80 deg
+    assert stage.move_to(math.radians(10)) == pytest.approx(math.radians(9.9875))
     finish(port)
 
 
