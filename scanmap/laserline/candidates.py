@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -36,12 +36,21 @@ class Candidates(NamedTuple):
     snr: F32  # response over the noise; 0 where there is none
 
 
-def noise_of(plane: U8) -> float:
-    """Standard deviation of a sample's noise [grey levels], from differences of neighbours in a few rows."""
+def noises_of(planes: U8) -> F64:
+    """Standard deviations (P,) of the noise of a sample [grey levels] in pictures (P, H, W).
+
+    From differences of neighbours in a few rows.
+    """
+    pictures, height, width = planes.shape
     # As many samples as tell it to a hundredth.
-    rows = plane[:: max(1, len(plane) * min(plane.shape[1], 1600) // 20_000, len(plane) // 24)]
+    rows = planes[:, :: max(1, height * min(width, 1600) // 20_000, height // 24)]
     rows = np.ascontiguousarray(rows)
-    step = cv2.absdiff(rows[:, 1:], rows[:, :-1])
+    flat = rows.reshape(-1, width)
+    step = cv2.absdiff(flat[:, 1:], flat[:, :-1]).reshape(pictures, -1)
+    return np.array([_noise_from(own) for own in step])
+
+
+def _noise_from(step: NDArray[Any]) -> float:
     # Half of all differences of Gaussian noise lie below 0.954 sigma; counting is finer than the median of integers.
     count = cv2.calcHist([step], [0], None, [64], [0.0, 64.0]).ravel().cumsum() / max(step.size, 1)
     k = min(int(count.searchsorted(0.5)), 63)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.grey import runs_at
 from scanmap.laserline.runs import numbered
 
 F64 = NDArray[np.float64]
@@ -74,5 +75,7 @@ def _sampled(plane: U8, row: Index, column: F64) -> F64:
     x = np.minimum(np.maximum(column, 0.0), plane.shape[1] - 1.001)
     left = x.astype(np.intp)
     part = x - left
-    value: F64 = plane[row, left] * (1.0 - part) + plane[row, left + 1] * part
+    # Both neighbours in one run.
+    both = runs_at(plane, np.broadcast_to(row, left.shape), plane.strides[1] * left, plane.strides[1] + 1)
+    value: F64 = both[..., 0] * (1.0 - part) + both[..., -1] * part
     return value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -39,11 +39,11 @@ class Leads(NamedTuple):
     beside: F32  # where that is [px]
 
 
-def find_leads(rows: Sequence[U8], limits: tuple[F64, F64]) -> Leads:
+def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
     """The best place of each block, and the next best at two resolutions.
 
     Args:
-        rows: (N, W) one row of every other block of each of P pictures.
+        rows: (P, N, W) one row of every other block of each of P pictures.
         limits: first and last column (N,) that a block's line can have, NaN where it can have none.
     """
     # One picture after the other: all of them together would not fit into the processor's cache.
@@ -133,6 +133,9 @@ def _halved(values: U8 | U16) -> U16:
         sums = np.asarray(pairs >> 8, np.uint16)
         sums += pairs & 255
         return sums
+    if values.flags.c_contiguous and even == values.shape[1]:
+        both = values.view(np.uint32)
+        return ((both >> 16) + (both & 0xFFFF)).astype(np.uint16)
     return np.add(values[:, 0:even:2], values[:, 1:even:2], dtype=np.uint16)
 
 
@@ -146,22 +149,33 @@ def _stands_out(values: U16) -> U16:
 
 def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
     """The response, 0 outside the limits, in place."""
-    first, last = limits
-    width = response.shape[1]
-    some = ~np.isnan(first)
+    width, some = response.shape[1], ~np.isnan(limits[0])
     if not some.all():
         response[~some] = 0
-        first, last = first[some], last[some]
-        if not first.size:
+        if not some.any():
             return response
-    # In columns of the response, which lacks the picture's edge; only between the extremes do rows differ.
-    ends = np.array([first.min(), first.max(), last.min(), last.max()]) / scale - _EDGE
-    left, inner_left, inner_right, right = np.minimum(np.maximum(np.rint(ends), 0), width).astype(np.intp)
+    left, right, uneven = _beyond(limits[0].tobytes(), limits[1].tobytes(), scale, width)
     response[:, :left] = 0
     response[:, right + 1 :] = 0
+    for start, inside in uneven:
+        response[:, start : start + inside.shape[1]] *= inside
+    return response
+
+
+@lru_cache(maxsize=8)
+def _beyond(first: bytes, last: bytes, scale: int, width: int) -> tuple[int, int, list[tuple[int, U16]]]:
+    """First and last column (of `width`) of a response in the limits (N,), the same for every picture of a scan.
+
+    And where rows differ: a first column, and (N, n) 1 for what is within.
+    """
+    low, high = np.frombuffer(first), np.frombuffer(last)
+    # In columns of the response, which lacks the picture's edge; only between the extremes do rows differ.
+    ends = np.array([np.nanmin(low), np.nanmax(low), np.nanmin(high), np.nanmax(high)]) / scale - _EDGE
+    left, inner_left, inner_right, right = np.minimum(np.maximum(np.rint(ends), 0), width).astype(np.intp).tolist()
+    uneven = []
     for start, stop in ((left, inner_left + 1), (inner_right, right + 1)):
         if stop - start > 2:
             x = np.arange(start + _EDGE, min(stop, width) + _EDGE, dtype=np.float32) * scale + 0.5 * (scale - 1)
-            outside = ~((x >= limits[0][:, None] - scale) & (x <= limits[1][:, None] + scale))
-            response[:, start:stop][outside] = 0
-    return response
+            inside = (x >= low[:, None] - scale) & (x <= high[:, None] + scale)
+            uneven.append((start, inside.astype(np.uint16)))
+    return left, right, uneven

@@ -178,8 +178,9 @@ def _look(
 
 def _each(lines: LaserLine, height: int) -> list[LaserLine]:
     """The lines of pictures of `height` rows one below the other, each by itself."""
-    column, peak, width, sigma, reason = (np.split(values, len(values) // height) for values in lines)
-    return [LaserLine(*one) for one in zip(column, peak, width, sigma, reason, strict=True)]  # type: ignore[arg-type]
+    column, peak, width, sigma, reason = lines
+    own = [slice(k, k + height) for k in range(0, len(reason), height)]
+    return [LaserLine(column[k], peak[k], width[k], sigma[k], reason[k]) for k in own]
 
 
 def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:

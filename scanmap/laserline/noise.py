@@ -14,6 +14,7 @@ F64 = NDArray[np.float64]
 
 _CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
 _MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
+_TELLING_PAIRS = 300
 _TELLING = 128  # rows that are enough to say so
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 
@@ -61,35 +62,44 @@ def speckle_contrasts(residual: F32, signal: F32, weight: F32, rows: Rows) -> F6
     at = np.concatenate(quick)
     weights, left = weight.take(at, axis=1), residual.take(at, axis=1)
     own = dot(weights * left, left) / np.maximum(weights.sum(axis=0) - np.float32(4.0), np.float32(1.0))
-    first = 0
-    for k, (some, part) in enumerate(zip(quick, rows.parts, strict=True)):
+    first, asked = 0, list[int]()
+    for k, some in enumerate(quick):
         scatter, first = np.sort(own[first : first + len(some)]), first + len(some)
         if len(some) and scatter[len(some) // 2] >= _MORE_SCATTER * rows.noise_of[k] ** 2:
-            noise = float(rows.noise_of[k])
-            contrast[k] = _speckle_contrast(residual[:, part], signal[:, part], weight[:, part], noise)
+            asked.append(k)
+    if asked:
+        contrast[asked] = _speckle_contrasts(
+            residual, signal, weight, [rows.parts[k] for k in asked], rows.noise_of[asked]
+        )
     return contrast
 
 
-def _speckle_contrast(residual: F32, signal: F32, weight: F32, sample_noise: float) -> float:
-    """Speckle contrast of one picture.
+def _speckle_contrasts(residual: F32, signal: F32, weight: F32, parts: Sequence[slice], noise: F64) -> list[float]:
+    """Speckle contrasts of some pictures.
 
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
-    stride = max(1, residual.shape[1] // 300)
-    step = residual[:, 1::stride] - residual[:, :-1:stride]
-    level = np.minimum(signal[:, 1::stride], signal[:, :-1:stride])
-    core = weight[:, 1::stride] * weight[:, :-1:stride]
-    core *= level > 0.4 * level.max(axis=0, initial=0.0)
-    count = core.sum(axis=0)
-    usable = count >= 2
-    if usable.sum() < 20:
-        return 0.0
-    scatter = 0.5 * dot(core * step, step)[usable] / count[usable]
-    power = dot(core * level, level)[usable] / count[usable]
-    # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
-    excess = (scatter / _CORE_KEEPS - 1.5 * sample_noise**2) / power
-    excess.partition(len(excess) // 2)
-    return float(np.sqrt(max(float(excess[len(excess) // 2]) / 0.8, 0.0)))
+    pairs = [np.arange(p.start, p.stop - 1, max(1, (p.stop - p.start) // _TELLING_PAIRS)) for p in parts]
+    upper = np.concatenate(pairs)
+    (left, right), (a, b), (u, v) = (
+        (values.take(upper, axis=1), values.take(upper + 1, axis=1)) for values in (residual, signal, weight)
+    )
+    step, level, core = right - left, np.minimum(a, b), u * v
+    core *= level > np.float32(0.4) * level.max(axis=0, initial=0.0)
+    count, scatter, power = core.sum(axis=0), dot(core * step, step), dot(core * level, level)
+    contrasts, first = [], 0
+    for own, one_noise in zip(pairs, noise, strict=True):
+        of, first = slice(first, first + len(own)), first + len(own)
+        usable = count[of] >= 2
+        if usable.sum() < 20:
+            contrasts.append(0.0)
+            continue
+        # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
+        kept = 0.5 * scatter[of][usable] / count[of][usable] / _CORE_KEEPS
+        excess = (kept - 1.5 * one_noise**2) / (power[of][usable] / count[of][usable])
+        excess.partition(len(excess) // 2)
+        contrasts.append(float(np.sqrt(max(float(excess[len(excess) // 2]) / 0.8, 0.0))))
+    return contrasts
 
 
 def dot(a: F32, b: F32) -> F32:

@@ -6,8 +6,9 @@ of H rows are one of P H rows; what is a picture's own (noise, medians) is an ar
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +18,27 @@ F64 = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
-class Rows(NamedTuple):
+@dataclass(frozen=True)
+class Rows:
     """N rows of P pictures."""
 
     picture: Index  # (N,) which of them each row is of, rising
     noise_of: F64  # (P,) of a sample of each picture [grey levels]
 
-    @property
+    @cached_property
     def noise(self) -> F32:
         """Noise of a sample of each row (N,)."""
         return self.noise_of.astype(np.float32)[self.picture]
 
-    @property
+    @cached_property
     def parts(self) -> list[slice]:
         """Where the rows of each picture stand."""
         return by_picture(self.picture, len(self.noise_of))
 
     def of(self, some: Index | slice) -> Rows:
         """Some of the rows."""
+        if isinstance(some, slice) and some == slice(None):
+            return self
         return Rows(self.picture[some], self.noise_of)
 
 

@@ -205,16 +205,17 @@ def _risk(significance: Array, at: Index, shape: tuple[int, ...]) -> Array:
     """
     doubtful = significance + _BEND_DOUBT
     own = 1.0 + (6.0 * _BEND_DOUBT * significance / doubtful - 2.0 * _BEND_DOUBT) / doubtful
-    pictures, height = shape
-    # Sums up to each row of a picture of the rows before it, and how many those are.
-    total, count = np.zeros((pictures, height + 1)), np.zeros((pictures, height + 1))
-    row, picture = at % height, at // height
-    total[picture, row + 1], count[picture, row + 1] = own, 1.0
-    np.cumsum(total, axis=1, out=total)
-    np.cumsum(count, axis=1, out=count)
-    low, high = np.maximum(row - _BEND_ROWS // 2, 0), np.minimum(row + _BEND_ROWS // 2 + 1, height)
-    mean = (total[picture, high] - total[picture, low]) / (count[picture, high] - count[picture, low])
-    risk: Array = np.maximum(mean, _BEND_LEAST)
+    height = shape[-1]
+    # Sums over the rows of a picture before each, and how many those are; a picture has one more than rows.
+    sums = np.zeros((2, int(np.prod(shape[:-1])), height + 1))
+    flat = sums.reshape(2, -1)
+    first = at + at // height
+    row = at % height
+    flat[0, first + 1], flat[1, first + 1] = own, 1.0
+    np.cumsum(sums, axis=2, out=sums)
+    low, high = np.minimum(row, _BEND_ROWS // 2), np.minimum(height - row, _BEND_ROWS // 2 + 1)
+    total, count = flat[:, first + high] - flat[:, first - low]
+    risk: Array = np.maximum(total / count, _BEND_LEAST)
     return risk
 
 

@@ -90,7 +90,7 @@ def _settled(sight: Sight, window: F64, min_snr: float) -> _Quick:
     """What one row of every other block settles; in the blocks between, the line must go on as high."""
     first, last = block_window(window)
     shape = (len(sight.noise), len(first))
-    leads = find_leads(np.split(sight.rows, shape[0]), (first[::2], last[::2]))
+    leads = find_leads(sight.rows.reshape(shape[0], -1, sight.rows.shape[1]), (first[::2], last[::2]))
     good = settled(leads, sight.noise, min_snr)
     known = np.zeros(good.shape, np.float32)
     if sight.image_rows is not None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.candidates import BLOCK, is_large, noise_of
+from scanmap.laserline.candidates import BLOCK, is_large, noises_of
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
@@ -100,14 +100,13 @@ def sight_of(
     if channel == ONE_FOR_ALL:
         channel, image, background = None, image[..., 1], None if background is None else background[..., 1]
     large = is_large(image[:height])
-    pictures = range(0, len(image), height)
     if channel is not None and background is None:
-        seen = np.concatenate([quick_rows(image[k : k + height]) for k in pictures])
+        seen = quick_rows(image, height)
         rows = np.asarray(cv2.extractChannel(seen, channel), np.uint8)
         # Most of a large picture is never looked at.
         plane = image[..., channel] if large else extract(image, channel)
         noise = _noises(plane, rows, height)
-        each = zip(pictures, noise, roundings, strict=True)
+        each = zip(range(0, len(image), height), noise, roundings, strict=True)
         mixtures = [_mixture(image[k : k + height], channel, own, rounding) for k, own, rounding in each]
         return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
@@ -115,7 +114,7 @@ def sight_of(
     if background is not None:
         off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
-    rows = np.concatenate([quick_rows(lit[k : k + height]) for k in pictures])
+    rows = np.ascontiguousarray(quick_rows(lit, height))
     noise = _noises(lit, rows, height)
     mixtures = [Mixture(-1 if channel is None else channel)] * len(noise)
     return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain)
@@ -133,18 +132,26 @@ def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
     return ONE_FOR_ALL if channel is not None and not clear and without_colour(image) else channel
 
 
-def quick_rows(image: U8) -> U8:
-    """The second row of every other block of rows (ceil(B / 2), ...)."""
-    rows = image[1 :: 2 * BLOCK]
-    return rows if len(rows) == -(-len(image) // (2 * BLOCK)) else np.concatenate([rows, image[-1:]])
+def quick_rows(image: U8, height: int) -> U8:
+    """The second row of every other block of rows (P ceil(B / 2), ...) of pictures of `height` rows; a view if it can.
+
+    A picture's last row stands for one that it lacks.
+    """
+    if height % (2 * BLOCK) == 0:
+        return image[1 :: 2 * BLOCK]
+    row = np.minimum(np.arange(1, height + 2 * BLOCK - 1, 2 * BLOCK), height - 1)[: -(-height // (2 * BLOCK))]
+    return image[(np.arange(0, len(image), height)[:, None] + row).ravel()]
 
 
 def _noises(plane: U8, rows: U8, height: int) -> F64:
     """Noise (P,) of a sample of pictures of `height` rows."""
     # What is in the cache already, where it is enough.
-    if is_large(plane[:height]):
-        return np.array([noise_of(some) for some in np.split(rows, len(plane) // height)])
-    return np.array([noise_of(plane[k : k + height]) for k in range(0, len(plane), height)])
+    some = rows if is_large(plane[:height]) else plane
+    return noises_of(some.reshape(len(plane) // height, -1, plane.shape[1]))
+
+
+def _noise_of(plane: U8) -> float:
+    return float(noises_of(plane[None])[0])
 
 
 def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -> Mixture:
@@ -159,8 +166,8 @@ def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -
         return best_mixture(rounding, channel, _noise_in_band(image, channel))
     rows = np.ascontiguousarray(image[:: max(1, len(image) // 8), ::2])
     own, other = (np.asarray(cv2.extractChannel(rows, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
-    difference = noise_of(np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8))
-    fine = difference / (_INDEPENDENT * noise_of(other)) if difference > _NONE else 0.0
+    difference = _noise_of(np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8))
+    fine = difference / (_INDEPENDENT * _noise_of(other)) if difference > _NONE else 0.0
     if fine >= 1.0:
         return Mixture(-1)
     colour = fine + (1.0 - fine) * min(_COLOUR + _COLOUR_PER_NOISE * noise, 1.0)
@@ -177,5 +184,5 @@ def _noise_in_band(image: U8, channel: int) -> tuple[float, float, float]:
     means = cv2.resize(rows, (max(rows.shape[1] // _BAND_PX, 1), len(rows)), interpolation=cv2.INTER_AREA)
     own, other = (np.asarray(cv2.extractChannel(means, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
     difference = np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8)
-    first, second, both = (round(float(np.sqrt(_BAND_PX)) * noise_of(plane), 1) for plane in (own, other, difference))
+    first, second, both = (round(float(np.sqrt(_BAND_PX)) * _noise_of(plane), 1) for plane in (own, other, difference))
     return first, second, both

@@ -8,6 +8,7 @@ which would run the user's script once more in each of them, or copy a process i
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import logging
 import os
@@ -47,11 +48,12 @@ _HELPS_CORES = 4
 _PIPE_BYTES = 1 << 20
 PATIENCE_S = 5.0
 # glibc gives large arrays back to the system as they are freed, and asking for them anew costs a fifth of a frame's
-# time in page faults, asking for little at a time another 3 %; elsewhere these names mean nothing.
+# time in page faults, asking for little at a time another 3 %; elsewhere these names mean nothing. Names in the
+# environment of a worker, numbers (malloc.h) for this process.
 _KEEP_MEMORY = {
-    "MALLOC_MMAP_THRESHOLD_": "1073741824",
-    "MALLOC_TRIM_THRESHOLD_": "1073741824",
-    "MALLOC_TOP_PAD_": "67108864",
+    ("MALLOC_MMAP_THRESHOLD_", -3): 1 << 30,
+    ("MALLOC_TRIM_THRESHOLD_", -1): 1 << 30,
+    ("MALLOC_TOP_PAD_", -2): 1 << 26,
 }
 
 # The worker imports scanmap from where this process did.
@@ -95,6 +97,7 @@ class Processes:
         self.threads = IN_FLIGHT * len(self._workers) + helps
         self._free: queue.SimpleQueue[_Worker | None] = queue.SimpleQueue()  # None: this process itself
         if helps:
+            _keep_memory()
             self._free.put(None)
         for _ in range(IN_FLIGHT):
             for worker in self._workers:
@@ -152,7 +155,7 @@ class _Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
-            env=os.environ | _KEEP_MEMORY,
+            env=os.environ | {name: str(size) for (name, _), size in _KEEP_MEMORY.items()},
         )
         self._to = cast(IO[bytes], self._process.stdin)
         self._back = cast(IO[bytes], self._process.stdout)
@@ -193,6 +196,13 @@ class _Worker:
             self._process.kill()
             self._process.wait()
         self._back.close()
+
+
+def _keep_memory() -> None:
+    """What the workers' environment says, for this process."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library
+        for (_, number), size in _KEEP_MEMORY.items():
+            ctypes.CDLL(None).mallopt(number, size)
 
 
 def _widen(pipe: IO[bytes]) -> None:
