@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scanmap.calibration import Calibration, CalibrationFile, HeadTable, ImageTable
 from scanmap.calibration.file import AxisTable
 from scanmap.geometry import inverse, transform
-from scanmap.laserline import LaserLineParams, Reason
+from scanmap.laserline import LaserLineParams, Reason, ridge_of
 from scanmap.pipeline import Pipeline, SecondLook, run
-from scanmap.pipeline.still import FIRST, ROWS, StillThings
+from scanmap.pipeline.still import StillThings
 from scanmap.scan import Scan
 from scanmap.shot import Shot
-from scanmap.triangulation import TriangulationParams, column_window
+from scanmap.triangulation import TriangulationParams
 
 F64 = NDArray[np.float64]
 
@@ -23,6 +23,7 @@ WIDTH, HEIGHT = 640, 240
 STEP = np.radians(6.0)
 BEARINGS = np.arange(0, 24) * STEP
 WALL_Y = 2.0  # the only wall, y = 2 in the world, right across the sweep
+SEEN = 15  # of the bearings, one from which the tube at (0.6, 1.9) is seen well
 BRIGHT, TUBE = 90.0, 190.0  # [grey levels] of the line and of the tube
 
 
@@ -62,98 +63,105 @@ def tube(x: float, y: float, low: float = -0.4, high: float = 0.4) -> F64:
     return np.stack([np.full(600, x), np.full(600, y), np.linspace(low, high, 600)], axis=1)
 
 
-def places_of(calibration: Calibration, bearing: float, things: list[F64]) -> NDArray[np.float32]:
-    """What `laserline.look` would list: the line on the wall, and the things."""
-    rows = np.arange(FIRST, HEIGHT, ROWS)
-    found = [line_on_wall(calibration, bearing)[rows]]
-    for thing in things:
-        pixel = seen(calibration, bearing, thing)
-        column = np.full(len(rows), np.nan)
-        pixel = pixel[np.isfinite(pixel[:, 0])]
-        if len(pixel) > 1:
-            order = np.argsort(pixel[:, 1])
-            column = np.interp(rows, pixel[order, 1], pixel[order, 0], left=np.nan, right=np.nan)
-        found.append(column)
-    return np.stack(found, axis=1).astype(np.float32)
+def columns_of(calibration: Calibration, bearing: float, thing: F64) -> F64:
+    """Columns (H,) of a thing, NaN where it is not seen."""
+    pixel = seen(calibration, bearing, thing)
+    pixel = pixel[np.isfinite(pixel[:, 0])]
+    order = np.argsort(pixel[:, 1])
+    if len(pixel) < 2:
+        return np.full(HEIGHT, np.nan)
+    return np.interp(np.arange(HEIGHT), pixel[order, 1], pixel[order, 0], left=np.nan, right=np.nan)
 
 
 def collected(calibration: Calibration, things: list[F64], bearings: F64 = BEARINGS) -> StillThings:
-    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
+    """What pictures of the wall's line and of things as bright as it show."""
+    still, rng = StillThings(calibration), np.random.default_rng(3)
+    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
     for bearing in bearings:
-        still.add(float(bearing), places_of(calibration, float(bearing), things))
+        image = drawn(calibration, float(bearing), things, BRIGHT, rng)
+        ridges = pipeline.ridges(Shot(0, float(bearing), float(bearing), 0.0, image, None))
+        assert ridges is not None
+        still.add(float(bearing), ridges)
     return still
 
 
-def asked(calibration: Calibration, still: StillThings, bearing: float, column: F64) -> NDArray[np.bool_]:
-    """What `still` says of columns (ceil(H / ROWS),) taken for the laser line."""
-    rows = np.arange(FIRST, HEIGHT, ROWS)
-    rays = calibration.intrinsics.rays(column, rows.astype(np.float64)) @ calibration.T_head_camera[:3, :3].T
-    camera = calibration.T_head_camera[:3, 3]
-    points = camera - (camera[1] / rays[:, 1])[:, None] * rays  # the laser plane is y = 0
-    distance = np.hypot(*transform(calibration.mount.T_axis_head(), points)[:, :2].T)
-    return still.stands(np.full(len(rows), bearing), rows, column, distance)
+def asked(still: StillThings, bearing: float, column: F64, height: float = BRIGHT) -> NDArray[np.bool_]:
+    """What `still` says of columns (H,) taken for the laser line."""
+    return still.line(bearing, column, ridge_of(np.full(HEIGHT, height), np.full(HEIGHT, 1.5)))
 
 
 def test_a_tube_stands_and_the_line_does_not() -> None:
     calibration, lamp = head(), tube(0.6, 1.9)
     still = collected(calibration, [lamp])
-    assert still.count()
     tubes = lines = rows = 0
-    for bearing in BEARINGS:
-        line, thing = places_of(calibration, float(bearing), [lamp]).astype(np.float64).T
-        found = np.isfinite(line)
-        rows += int(found.sum())
-        lines += int(asked(calibration, still, float(bearing), np.where(found, line, 100.0))[found].sum())
-        far = np.isfinite(thing) & (thing > 250.0)  # columns of points nearer than half the wall's distance
-        if far.any():
+    for bearing in map(float, BEARINGS):
+        line, thing = line_on_wall(calibration, bearing), columns_of(calibration, bearing, lamp)
+        apart = np.isfinite(line) & ~(np.abs(line - thing) < 20.0)
+        rows += int(apart.sum())
+        lines += int(asked(still, bearing, np.where(apart, line, np.nan)).sum())
+        shown = np.isfinite(thing) & ~(np.abs(line - thing) < 20.0)
+        if shown.sum() > 40:
             tubes += 1
-            assert asked(calibration, still, float(bearing), np.where(far, thing, 300.0))[far].mean() > 0.9
-    assert tubes >= 4
-    assert lines < 0.01 * rows
+            assert asked(still, bearing, np.where(shown, thing, np.nan))[shown].mean() > 0.9
+    assert tubes >= 5
+    assert lines < 0.005 * rows
+
+
+def test_a_short_piece_of_a_tube_stands_too() -> None:
+    calibration, lamp = head(), tube(0.6, 1.9)
+    still, bearing = collected(calibration, [lamp]), float(BEARINGS[SEEN])
+    thing = columns_of(calibration, bearing, lamp)
+    row = np.flatnonzero(np.isfinite(thing))
+    short = np.full(HEIGHT, np.nan)
+    short[row[60:70]] = thing[row[60:70]]
+    assert asked(still, bearing, short)[row[60:70]].mean() > 0.7
+    assert not asked(still, bearing, short + 25.0).any()
 
 
 def test_where_the_laser_meets_the_thing_itself_it_is_kept() -> None:
     calibration, lamp = head(), tube(0.6, 1.9)
     still = collected(calibration, [lamp])
-    still.count()
-    # The bearing at which the laser's plane passes through the tube: there its column is the laser's own.
-    own = min(
-        np.linspace(1.0, 1.6, 6001), key=lambda b: abs(inverse(calibration.mount.T_world_head(b))[1] @ [*lamp[300], 1])
-    )
-    thing = places_of(calibration, float(own), [lamp])[:, 1].astype(np.float64)
+    bearing = float(BEARINGS[SEEN]) + 0.01
+    thing = columns_of(calibration, bearing, lamp)
     known = np.isfinite(thing)
-    assert known.sum() > 10
-    inner = np.flatnonzero(known)[2:-2]  # at its ends fewer bearings see it
-    assert not asked(calibration, still, float(own), np.where(known, thing, 0.0))[inner].any()
+    assert known.sum() > 40
+    # As high as in every other picture it is the thing; three times as high the laser has met it.
+    assert asked(still, bearing, thing, 0.9 * BRIGHT)[known].mean() > 0.9
+    assert not still.line(bearing, thing, 3.0 * ridge_of(np.full(HEIGHT, BRIGHT), np.full(HEIGHT, 1.5))).any()
 
 
-def test_a_thing_seen_twice_proves_nothing() -> None:
+def test_a_thing_seen_in_two_other_pictures_proves_nothing() -> None:
     calibration, lamp = head(), tube(0.6, 1.9)
-    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
-    for bearing in BEARINGS[9:11]:
-        still.add(float(bearing), places_of(calibration, float(bearing), [lamp])[:, 1:])
-    assert not still.count()
+    some = BEARINGS[SEEN - 1 : SEEN + 2]
+    thing = columns_of(calibration, float(some[1]), lamp)
+    assert np.isfinite(thing).sum() > 40
+    assert not asked(collected(calibration, [lamp], some), float(some[1]), thing).any()
+    assert asked(collected(calibration, [lamp], BEARINGS[SEEN - 2 : SEEN + 3]), float(some[1]), thing).any()
 
 
 def test_a_second_turn_is_no_other_view() -> None:
     calibration, lamp = head(), tube(0.6, 1.9)
-    still = StillThings(calibration, column_window(calibration, TriangulationParams()))
-    for turn in range(4):
-        still.add(float(BEARINGS[9] + 2.0 * np.pi * turn), places_of(calibration, float(BEARINGS[9]), [lamp])[:, 1:])
-    assert not still.count()
+    bearing = float(BEARINGS[SEEN])
+    thing = columns_of(calibration, bearing, lamp)
+    assert np.isfinite(thing).sum() > 40
+    still = collected(calibration, [lamp], bearing + 2.0 * np.pi * np.arange(1, 5))
+    assert not asked(still, bearing, thing).any()
 
 
 def test_the_mask_covers_the_thing_at_every_bearing_and_little_else() -> None:
     calibration, lamp = head(), tube(0.6, 1.9)
-    still = collected(calibration, [lamp])
-    still.count()
-    for bearing in BEARINGS[4:12]:
-        mask = still.mask(float(bearing), 4)
+    still, rng = collected(calibration, [lamp]), np.random.default_rng(4)
+    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
+    for bearing in map(float, BEARINGS[4:12]):
+        image = drawn(calibration, bearing, [lamp], BRIGHT, rng)
+        ridges = pipeline.ridges(Shot(0, bearing, bearing, 0.0, image, None))
+        assert ridges is not None
+        mask = still.mask(bearing, ridges)
         assert mask.shape == (HEIGHT // 4, WIDTH)
-        pixel = np.rint(seen(calibration, float(bearing), lamp))
-        pixel = pixel[np.isfinite(pixel[:, 0])].astype(int)
-        if len(pixel):
-            assert mask[pixel[:, 1] // 4, pixel[:, 0]].mean() > 0.9
+        thing = columns_of(calibration, bearing, lamp)
+        row = np.flatnonzero(np.isfinite(thing))
+        if len(row):
+            assert mask[row // 4, np.rint(thing[row]).astype(int)].mean() > 0.9
         assert mask.mean() < 0.12
 
 

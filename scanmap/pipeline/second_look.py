@@ -7,31 +7,32 @@ times less than the usual surface of this scan is less than black paint seen at 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline import BLOCK, Reason
+from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
-from scanmap.pipeline.still import FIRST, ROWS, StillThings
+from scanmap.pipeline.still import StillThings
 from scanmap.scan import Scan
 from scanmap.shot import Shot
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Shots = Callable[[], Iterable[Shot]]
 
 _LOOKS = 3  # each may show what was hidden behind the last
 _LEAST_ROWS = 8  # of a picture that are worth another look
-# Rows of places asked together; the share of those with a point, and the number, that must agree.
-_NEAR, _MOSTLY, _AGREE = 5, 0.6, 4
-# A point this close to the axis may be any of nearly all columns of the picture, and seldom is there such a thing.
-_CLOSE_M, _AGREE_CLOSE = 0.5, 2
 _DIM, _UNCLIPPED = 0.0025, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
-_ALIKE_PX = 4.0  # how far the line may run from the row that was asked, of ROWS
 _AROUND_PX = 8  # beside a line that is none, nothing is looked for
+_APART = float(np.radians(2.9))  # between pictures that are compared with others
+_NEXT = 1.5  # times that, within which what stands beside a picture is asked in others too
 
 
 class SecondLook:
@@ -39,20 +40,19 @@ class SecondLook:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self._still = StillThings(pipeline.calibration, pipeline.window)
         self._keys: list[tuple[float, float]] = []
         self._reflectance: list[F32] = []
+        self._ridge: list[F32] = []
         self._places: list[F32 | None] = []
 
     def __call__(self, step: Step) -> None:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
         self._keys.append((step.shot.time, step.shot.bearing))
         self._reflectance.append(_reflectance(step))
+        self._ridge.append(ridge_of(step.line.peak, step.line.width_px).astype(np.float32))
         self._places.append(None if step.fault else step.places)
 
-    def settle(
-        self, scan: Scan, shots: Callable[[], Iterable[Shot]] | None, without: Collection[int] = frozenset()
-    ) -> int:
+    def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
 
         Args:
@@ -60,23 +60,25 @@ class SecondLook:
             shots: the same shots once more; None where they are gone, and points can only be given up.
             without: bearings of the scan, by their index, that are left alone and say nothing.
         """
-        doubted, usual = 0, self._usual()
-        asked = np.array([k for k in range(len(scan)) if k not in without], np.intp)
+        asked = [k for k in range(len(scan)) if k not in without]
+        usual = self._usual()
+        views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
+        still = self._listed(scan, views) if shots is None else self._shown(scan, views, shots())
+        wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
-            if (places := self._places[k]) is not None:
-                self._still.add(float(scan.bearings[k]), places)
-        for looks_left in range(_LOOKS if shots is not None else 0, -1, -1):
-            wrong = self._wrong(scan, asked, usual)
-            asked = np.flatnonzero(wrong.sum(axis=1) >= _LEAST_ROWS)
-            if not asked.size:
-                break
-            wrong[np.setdiff1d(np.arange(len(scan)), asked)] = False
-            doubted += int(wrong.sum())
-            masks = {int(k): self._mask(scan, int(k), wrong[k]) for k in asked} if looks_left else {}
+            with np.errstate(invalid="ignore"):
+                wrong[k] = self._reflectance[k] < _DIM * usual
+        for k in views:
+            wrong[k] |= still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k])
+        for k in _beside(scan.bearings, asked, views, [k for k in views if wrong[k].any()]):
+            wrong[k] |= still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k])
+        wrong &= scan.valid
+        again = wrong.sum(axis=1) >= _LEAST_ROWS
+        if shots is None or not again.any():
             scan.give_up(wrong, Reason.AMBIGUOUS)
-            if looks_left and shots is not None:
-                self._look_again(scan, wrong, masks, shots())
-        return doubted
+        else:
+            self._look_again(scan, wrong, again, still, usual, shots())
+        return int(wrong.sum())
 
     def _usual(self) -> float:
         known = np.concatenate(
@@ -84,59 +86,73 @@ class SecondLook:
         )
         return float(np.median(known)) if known.size else 0.0
 
-    def _wrong(self, scan: Scan, asked: NDArray[np.intp], usual: float) -> Mask:
-        """Cells (B, H) of the bearings `asked` that are not the line."""
-        wrong = np.zeros((len(scan), scan.rows), bool)
-        valid = scan.valid
-        for k in asked:
-            with np.errstate(invalid="ignore"):
-                wrong[k] = valid[k] & (self._reflectance[k] < _DIM * usual)
-        if not self._still.count():
-            return wrong
-        column = scan.column_px[asked, FIRST::ROWS]
-        i, j = np.nonzero(valid[asked, FIRST::ROWS])
-        row = j * ROWS + FIRST
-        distance = np.hypot(*np.moveaxis(scan.points[asked[i], row, :2], -1, 0)).astype(np.float64)
-        stands, known, close = (np.zeros(column.shape, np.float32) for _ in range(3))
-        known[i, j], close[i, j] = 1.0, distance < _CLOSE_M
-        stands[i, j] = self._still.stands(scan.bearings[asked[i]], row, column[i, j].astype(np.float64), distance)
-        together = np.ones(_NEAR)
-        for k, values, have, nearby in zip(asked, stands, known, close, strict=True):
-            if values.any():
-                near, all_near = (np.convolve(v, together, "same") for v in (values, have))
-                still = (near >= _MOSTLY * all_near) & (near >= np.where(nearby > 0, _AGREE_CLOSE, _AGREE))
-                wrong[k] |= _over_rows(still, scan.column_px[k]) & valid[k]
-        return wrong
+    def _shown(self, scan: Scan, views: list[int], shots: Iterable[Shot]) -> StillThings:
+        """What the pictures of some bearings show, read once more."""
+        still, wanted = StillThings(self._pipeline.calibration), {self._keys[k] for k in views}
+        with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="decode") as pool:
+            some = (shot for shot in shots if (shot.time, shot.bearing) in wanted)
+            for bearing, ridges in pool.map(lambda shot: (shot.bearing, self._pipeline.ridges(shot)), some):
+                if ridges is not None:
+                    still.add(bearing, ridges)
+        return still
 
-    def _mask(self, scan: Scan, k: int, wrong: Mask) -> Mask:
-        """Where a picture's line is not to be looked for: what stands still, and what was taken for it."""
-        mask = self._still.mask(float(scan.bearings[k]), BLOCK)
-        row = np.flatnonzero(wrong)
-        column = np.rint(scan.column_px[k, row]).astype(np.intp)[:, None] + np.arange(-_AROUND_PX, _AROUND_PX + 1)
-        mask[row[:, None] // BLOCK, np.clip(column, 0, mask.shape[1] - 1)] = True
-        return mask
+    def _listed(self, scan: Scan, views: list[int]) -> StillThings:
+        """What was listed as line-like in the pictures of some bearings: less, but known without them."""
+        still, own = StillThings(self._pipeline.calibration), self._pipeline.calibration.intrinsics
+        for k in views:
+            places = np.asarray(self._places[k])
+            i, j = np.nonzero(np.isfinite(places))
+            ridges = np.zeros((len(places), own.width), np.uint8)
+            ridges[i, np.clip(np.rint(places[i, j]), 0, own.width - 1).astype(np.intp)] = 255
+            # One row in two blocks was listed.
+            still.add(float(scan.bearings[k]), np.repeat(ridges, 2, axis=0))
+        return still
 
-    def _look_again(self, scan: Scan, wrong: Mask, masks: dict[int, Mask], shots: Iterable[Shot]) -> None:
+    def _look_again(
+        self, scan: Scan, wrong: Mask, again: Mask, still: StillThings, usual: float, shots: Iterable[Shot]
+    ) -> None:
+        """Give up the cells `wrong` (B, H), and fill those without a point of the pictures `again` (B,)."""
         places: dict[tuple[float, float], list[int]] = {}
-        for k in masks:
+        masks = {}
+        for k in map(int, np.flatnonzero(again)):
             places.setdefault(self._keys[k], []).append(k)
+            masks[k] = self._around(scan.column_px[k], wrong[k])
+        scan.give_up(wrong, Reason.AMBIGUOUS)
 
         def wanted() -> Iterator[Shot]:
             for shot in shots:
                 if (shot.time, shot.bearing) in places:
                     yield shot
 
-        def again(shot: Shot) -> Step:
-            return self._pipeline.process(shot, masks[places[shot.time, shot.bearing][0]])
+        def look(shot: Shot) -> Step:
+            mask = masks[places[shot.time, shot.bearing][0]]
+            ridges = self._pipeline.ridges(shot)
+            if ridges is not None:
+                mask |= still.mask(shot.bearing, ridges)
+            for looks_left in range(_LOOKS - 1, -1, -1):
+                step = self._pipeline.process(shot, mask)
+                with np.errstate(invalid="ignore"):
+                    false = _reflectance(step) < _DIM * usual
+                false |= still.line(shot.bearing, step.line.column_px, ridge_of(step.line.peak, step.line.width_px))
+                if looks_left == 0 or false.sum() < _LEAST_ROWS:
+                    break
+                mask |= self._around(step.line.column_px, false)
+            step.profile.reason[false] = Reason.AMBIGUOUS
+            return step
 
         def take(step: Step) -> None:
             for k in places[step.shot.time, step.shot.bearing]:
-                scan.amend(k, wrong[k], step.profile)
-                self._reflectance[k] = np.where(wrong[k], _reflectance(step), self._reflectance[k])
-            if step.places is not None:
-                self._still.add(step.shot.bearing, step.places)
+                scan.amend(k, ~scan.valid[k] & (step.profile.reason == Reason.OK), step.profile)
 
-        run(wanted(), again, [take])
+        run(wanted(), look, [take])
+
+    def _around(self, column: F32 | F64, rows: Mask) -> Mask:
+        """(ceil(H / BLOCK), W) that is True around the line's columns (H,) in some rows (H,)."""
+        mask = np.zeros((-(-len(rows) // BLOCK), self._pipeline.calibration.intrinsics.width), bool)
+        row = np.flatnonzero(rows)
+        around = np.rint(column[row]).astype(np.intp)[:, None] + np.arange(-_AROUND_PX, _AROUND_PX + 1)
+        mask[row[:, None] // BLOCK, np.clip(around, 0, mask.shape[1] - 1)] = True
+        return mask
 
 
 def _reflectance(step: Step) -> F32:
@@ -146,10 +162,19 @@ def _reflectance(step: Step) -> F32:
         return (light * step.profile.range_m**2).astype(np.float32)
 
 
-def _over_rows(asked: Mask, column: F32) -> Mask:
-    """Verdicts on one row in ROWS, over the rows (H,) around it that have the same line."""
-    index = np.minimum(np.arange(len(column)) // ROWS, len(asked) - 1)
-    with np.errstate(invalid="ignore"):
-        same = np.abs(column - column[FIRST::ROWS][index]) < _ALIKE_PX
-    verdict: Mask = asked[index] & (same | np.isnan(column[FIRST::ROWS][index]))
-    return verdict
+def _apart(bearings: F64, some: list[int]) -> list[int]:
+    """Those of some bearings [rad], by their index, that see something new: no second turn, nor closely beside."""
+    turn = 2.0 * np.pi
+    chosen: list[int] = []
+    for k in sorted(some, key=lambda k: (bearings[k] % turn, bearings[k])):
+        if not chosen or bearings[k] % turn - bearings[chosen[-1]] % turn >= _APART:
+            chosen.append(k)
+    return chosen
+
+
+def _beside(bearings: F64, asked: list[int], views: list[int], some: list[int]) -> list[int]:
+    """Those of the bearings [rad] `asked` that lie next to `some` of the views, by their index, and are no views."""
+    turn = (bearings[:, None] - bearings[some] + np.pi) % (2.0 * np.pi) - np.pi
+    near = np.any(np.abs(turn) <= _NEXT * _APART, axis=1)
+    near[views] = False
+    return [k for k in asked if near[k]]

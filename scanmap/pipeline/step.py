@@ -22,6 +22,7 @@ from scanmap.laserline import (
     look,
     look_at_all,
     needs_colour,
+    ridges,
     rounding_of,
 )
 from scanmap.shot import Decoded, Image, Shot, decode_image
@@ -125,6 +126,14 @@ class Pipeline:
             line = _without_rows(line, rows)
             fault = f"image is cut: {rows} of {len(line.reason)} rows are whole"
         return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
+
+    def ridges(self, shot: Shot) -> NDArray[np.uint8] | None:
+        """What of a shot's image looks like a line, as `laserline.ridges` has it; None where it cannot be read."""
+        try:
+            image = self._decode(shot.image).image
+        except CameraError:
+            return None
+        return ridges(image, self.laserline)
 
     def _decode(self, data: bytes, into: Image | None = None) -> Decoded:
         decoded = decode_image(data, grey=not self.colour, into=into)
