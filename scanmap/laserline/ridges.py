@@ -20,12 +20,16 @@ _SHARE = 0.8  # of its height that a line has in the best of these, unless it is
 _CUT = 140.0  # [grey levels] what a bright line has more than this is often cut at white in another picture
 
 
-def ridges(image: U8, params: LaserLineParams) -> U8:
+def ridges(image: U8, params: LaserLineParams, channel: int | None = None) -> U8:
     """How far each place of a picture (H, W) or (H, W, 3) rises over both its sides (ceil(H / BLOCK), W) [grey levels].
 
     In the plane that the line is looked for in, in means over BLOCK rows, and at the best of three widths.
+
+    Args:
+        channel: the laser's, where other pictures of the scan have told it.
     """
-    channel = channel_of(image, None, params.grey)
+    if channel is None or image.ndim == 2:
+        channel = channel_of(image, None, params.grey)
     own = channel == ONE_FOR_ALL
     plane = extract(image, 1) if own else to_grey(image, params.grey, params.bit_index, channel)
     height, width = plane.shape

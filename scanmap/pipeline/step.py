@@ -133,7 +133,7 @@ class Pipeline:
             image = self._decode(shot.image).image
         except CameraError:
             return None
-        return ridges(image, self.laserline)
+        return ridges(image, self.laserline, self.channel)
 
     def _decode(self, data: bytes, into: Image | None = None) -> Decoded:
         decoded = decode_image(data, grey=not self.colour, into=into)
