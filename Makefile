@@ -48,6 +48,7 @@ bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/twin.py
 	$(BIN)/python benchmarks/hard_sweep.py
 	$(BIN)/python benchmarks/sweeps.py
+	$(BIN)/python benchmarks/mirrors.py
 
 lock:
 	uv lock

@@ -26,6 +26,7 @@ class Reason(IntEnum):
     OUTLIER = 9  # removed by the filter over neighbours in the range image
     NOT_SCANNED = 10  # no shot covers this cell
     NARROW = 11  # narrower than any line: hot pixels, a bad sensor column
+    MIRROR = 12  # seen in a mirror: the image of a point elsewhere in the room
 
     @property
     def words(self) -> str:
@@ -46,6 +47,7 @@ _WORDS = {
     Reason.OUTLIER: "outlier among its neighbours",
     Reason.NOT_SCANNED: "not scanned",
     Reason.NARROW: "too narrow for the line",
+    Reason.MIRROR: "seen in a mirror",
 }
 
 

@@ -23,6 +23,7 @@ class ScanParams(BaseModel, frozen=True, extra="forbid"):
     second_look: bool = Field(
         True, description="after the sweep, look again where a thing that stands still was taken for the line"
     )
+    mirrors: bool = Field(True, description="remove points seen in mirrors on walls, where the scan itself proves them")
     filter_outliers: bool = Field(True, description="remove points that no neighbour in the range image supports")
     merge_deg: float = Field(0.02, ge=0, description="bearings closer than this are one column [deg]")
     support_px: float = Field(

@@ -21,6 +21,7 @@ from scanmap.laserline import Reason
 from scanmap.pipeline import Pipeline, Processes, Runner, SecondLook, Sink, Step, checked, run, worth_processes
 from scanmap.recording import Recorder, first_part
 from scanmap.scan import Scan
+from scanmap.scan.mirrors import without_mirrors
 from scanmap.scan.surface import remove_outliers
 from scanmap.session.noting import noting
 from scanmap.session.outputs import Outputs, write_results
@@ -307,6 +308,8 @@ def is_scan_file(path: Path) -> bool:
 
 
 def finished_scan(scan: Scan, config: Config) -> Scan:
-    """Passes merged, sorted by bearing, outliers removed."""
-    merged = scan.merged(config.scan.merge_deg)
-    return remove_outliers(merged, config.scan) if config.scan.filter_outliers else merged
+    """Passes merged, sorted by bearing, outliers and what was seen in mirrors removed."""
+    finished = scan.merged(config.scan.merge_deg)
+    if config.scan.filter_outliers:
+        finished = remove_outliers(finished, config.scan)
+    return without_mirrors(finished, config.scan) if config.scan.mirrors else finished
