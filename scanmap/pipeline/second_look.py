@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
-from scanmap.pipeline.still import StillThings
+from scanmap.pipeline.still import SHARE, StillThings
 from scanmap.scan import Scan
 from scanmap.shot import Shot
 
@@ -32,6 +32,7 @@ _LEAST_ROWS = 8  # of a picture that are worth another look
 _DIM, _UNCLIPPED = 0.0025, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
 _AROUND_PX = 8  # beside a line that is none, nothing is looked for
 _APART = float(np.radians(2.9))  # between pictures that are compared with others
+_SUSPECT = 0.4  # share of the pictures that must list a place as line-like, for some of all to be read again
 _NEXT = 1.5  # times that, within which what stands beside a picture is asked in others too
 
 
@@ -63,15 +64,18 @@ class SecondLook:
         asked = [k for k in range(len(scan)) if k not in without]
         usual = self._usual()
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
-        still = self._listed(scan, views) if shots is None else self._shown(scan, views, shots())
+        still = self._listed(scan, views)
+        # Most scans of plain rooms need not be read again.
+        if shots is not None and any(self._stands(scan, k, still, _SUSPECT).sum() >= _LEAST_ROWS for k in views):
+            still = self._shown(scan, views, shots())
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
             with np.errstate(invalid="ignore"):
                 wrong[k] = self._reflectance[k] < _DIM * usual
         for k in views:
-            wrong[k] |= still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k])
+            wrong[k] |= self._stands(scan, k, still)
         for k in _beside(scan.bearings, asked, views, [k for k in views if wrong[k].any()]):
-            wrong[k] |= still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k])
+            wrong[k] |= self._stands(scan, k, still)
         wrong &= scan.valid
         again = wrong.sum(axis=1) >= _LEAST_ROWS
         if shots is None or not again.any():
@@ -79,6 +83,9 @@ class SecondLook:
         else:
             self._look_again(scan, wrong, again, still, usual, shots())
         return int(wrong.sum())
+
+    def _stands(self, scan: Scan, k: int, still: StillThings, share: float = SHARE) -> Mask:
+        return still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k], share)
 
     def _usual(self) -> float:
         known = np.concatenate(

@@ -38,7 +38,7 @@ _APART = float(np.radians(1.9))  # pictures nearer to each other show the line i
 _VIEWS, _FARTHEST = 12, float(np.radians(45.0))  # other pictures that are asked, and how far round they are
 _LEAST_VIEWS = 3
 _NOISE = 2.0  # [grey levels] of ridges; the dimmest line that counts has more, for it must exceed its own noise sixfold
-_SHARE = 0.6  # of the other pictures that must show what stands still
+SHARE = 0.6  # of the other pictures that must show what stands still
 _PART = 0.5  # of its height that a thing has in every picture
 _TOGETHER = 2  # rows of ridges before and after one that are asked with it
 _RUN_PX = 16.0  # that a line runs from one to the next, at most
@@ -80,7 +80,7 @@ class StillThings:
         )
         self._views[bearing] = _View(fine, coarse)
 
-    def line(self, bearing: float, column: F32 | F64, ridge: F32 | F64, share: float = _SHARE) -> Mask:
+    def line(self, bearing: float, column: F32 | F64, ridge: F32 | F64, share: float = SHARE) -> Mask:
         """Which rows (H,) of the line found in a picture taken at `bearing` [rad] show what stands still.
 
         Args:
