@@ -293,7 +293,7 @@ def test_recover_joins_parts_and_saves_what_a_cut_left(tmp_path: Path) -> None:
     source = open_source(joined)
     assert list(source.shots()) == list(open_source(first).shots()) and not source.faults
     assert replayed(joined, "d.ply") == (tmp_path / "whole" / "a.ply").read_bytes()
-    with pytest.raises(ScanmapError, match="exists already"):
+    with pytest.raises(ScanmapError, match="exists and is not overwritten"):
         session.recover(first)
     with pytest.raises(ScanmapError, match="whole, there is nothing to recover"):
         session.recover(joined, tmp_path / "e.mcap")

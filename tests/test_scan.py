@@ -139,12 +139,20 @@ def test_the_average_is_weighted_by_the_inverse_variance():
     np.testing.assert_allclose(scan.sigma_m, 0.002 / np.sqrt(5.0), rtol=1e-6)
 
 
-def test_where_passes_disagree_the_surer_one_stays_untouched():
-    sure, unsure = profile(1.0, 0.001), profile(3.0, 0.004)
+def test_where_passes_disagree_the_one_surer_of_its_column_stays_untouched():
+    """Near points are exact in metres, false ones too: 0.5 mm at 1 m are more of a column than 1 mm at 2 m."""
+    sure, unsure = profile(2.0, 0.001), profile(1.0, 0.0005)
     for order in ([sure, unsure], [unsure, sure]):
         merged = scan_of([(0.0, p) for p in order], HeadMount()).merged()
         np.testing.assert_array_equal(merged.points[0], np.float32(sure.points))
         np.testing.assert_allclose(merged.sigma_m, 0.001, rtol=1e-6)
+
+
+def test_what_most_passes_say_stays_however_sure_the_other_is():
+    passes = [profile(2.0, 0.01), profile(0.4, 0.0001), profile(2.01, 0.01)]
+    for first in range(3):
+        merged = scan_of([(0.0, p) for p in passes[first:] + passes[:first]], HeadMount()).merged()
+        np.testing.assert_allclose(merged.points[0, :, 0], 2.005, rtol=1e-6)
 
 
 def test_what_agrees_is_within_four_deviations_and_at_least_two_millimetres():

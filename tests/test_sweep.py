@@ -15,7 +15,7 @@ from scanmap.errors import CameraError, ConfigError, StageError
 from scanmap.rig import Frame, Rig
 from scanmap.rig.manual import ManualStage
 from scanmap.rig.stage import StageParams, open_stage
-from scanmap.sweep import SweepParams, between, plan, sweep
+from scanmap.sweep import SweepParams, between, missing, passes, plan, sweep
 from scanmap.twin.firmware import Firmware
 from scanmap.twin.ports import plug
 
@@ -244,6 +244,14 @@ def test_adaptive_sweep_visits_what_the_picture_asks_for(rig: Rig, firmware: Fir
     assert fine == pytest.approx([47.5, 45, 42.5, 37.5, 35, 32.5, 34, 36], abs=1 / 80)  # down, then up again
     assert [shot.index for shot in shots] == list(range(27))
     assert asked == [19, 25, 27]
+
+
+def test_the_last_slot_of_a_turn_may_be_empty_only_where_the_sweep_has_ended() -> None:
+    planned = plan(SweepParams(mode="continuous", step_deg=2, end_deg=80))
+    (turn,) = passes(planned)
+    assert missing(planned, turn, range(turn.slots - 1)) == [(turn.slots - 1, turn.slots - 1)]
+    assert missing(planned, turn, range(turn.slots - 1), ends=False) == []
+    assert missing(planned, turn, {*range(10), *range(14, turn.slots)}, ends=False) == [(10, 13)]
 
 
 @given(n=st.integers(2, 40), fine=st.floats(0.05, 5), mask=st.integers(0, 2**39 - 1))

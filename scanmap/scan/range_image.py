@@ -185,9 +185,9 @@ class Scan:
     def merged(self, tolerance_deg: float = 0.02) -> Scan:
         """Sorted by bearing, with bearings closer than the tolerance made one column.
 
-        Passes forward and backward, repeated bearings and a second turn measure the same cell: where they agree
-        within their errors (4 sigma, at least 2 mm) the points are averaged with weights 1 / sigma^2, where they do
-        not the one with the smaller sigma stays.
+        Passes forward and backward, repeated bearings and a second turn measure the same cell: points that agree
+        within their errors (4 sigma, at least 2 mm) are averaged with weights 1 / sigma^2. Where they do not all agree,
+        what most say stays; of what equally many say, that with the smaller error in columns of the picture.
         """
         bearings, groups = bearing_columns(self.bearings, float(np.radians(tolerance_deg)))
         fields = self.taken(np.array([group[0] for group in groups], np.intp))._fields
@@ -202,11 +202,20 @@ class Scan:
         """The fields of one column (H, ...) that the columns `group` of this scan measured together."""
         reason = self.reason[group]
         sigma = np.where(reason == Reason.OK, self.sigma_m[group], np.inf).astype(np.float64)
-        best, rows = sigma.argmin(axis=0), np.arange(self.rows)
+        rows = np.arange(self.rows)
         points = self.points[group].astype(np.float64)
-        apart = np.linalg.norm(points - points[best, rows], axis=-1)
-        agree = apart <= np.maximum(4.0 * np.hypot(sigma, sigma[best, rows]), 2e-3)
-        weight = np.where(agree & np.isfinite(sigma), 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+
+        def agreeing(k: Any) -> NDArray[np.bool_]:
+            apart = np.linalg.norm(points - points[k, rows], axis=-1)
+            close = apart <= np.maximum(4.0 * np.hypot(sigma, sigma[k, rows]), 2e-3)
+            return np.asarray(close & np.isfinite(sigma))
+
+        votes = np.stack([agreeing(k).sum(axis=0) for k in range(len(group))])
+        # In columns of the picture: in metres whatever is near is exact, and a false point often is near.
+        error = np.where(np.isfinite(sigma), sigma / np.square(self.range_m[group].astype(np.float64)), np.inf)
+        best = np.where(votes == votes.max(axis=0), error, np.inf).argmin(axis=0)
+        agree = agreeing(best)
+        weight = np.where(agree, 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
         total = weight.sum(axis=0)
         with np.errstate(invalid="ignore"):
             share = weight / total  # NaN in rows that no column measured, and so is their mean

@@ -76,7 +76,7 @@ def earlier_parts(path: Path, settings: tuple[str, ...] = ()) -> Earlier:
     if not seen:
         raise ConfigError(f"{path} has no shot from a bearing that can be trusted: scan again")
     done = frozenset(shot.index for shot in source.shots())
-    if _is_complete(planned, done) and (config.sweep.mode != "adaptive" or source.end_reason == "finished"):
+    if _is_complete(planned, done, ended=source.end_reason == "finished"):
         raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {path}")
     return Earlier(
         source=source,
@@ -93,10 +93,10 @@ def earlier_parts(path: Path, settings: tuple[str, ...] = ()) -> Earlier:
     )
 
 
-def _is_complete(planned: Plan, done: frozenset[int]) -> bool:
+def _is_complete(planned: Plan, done: frozenset[int], *, ended: bool) -> bool:
     if planned.params.mode == "continuous":
-        return not any(missing(planned, turn, done) for turn in passes(planned))
-    return done >= set(range(len(planned.bearings)))
+        return not any(missing(planned, turn, done, ends=not ended) for turn in passes(planned))
+    return done >= set(range(len(planned.bearings))) and (ended or planned.params.mode != "adaptive")
 
 
 def _check(path: Path, settings: tuple[str, ...]) -> None:

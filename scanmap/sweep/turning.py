@@ -58,10 +58,13 @@ def passes(planned: Plan) -> list[Pass]:
     return [Pass(number, start, end, slots) for number, (start, end) in enumerate(ends)]
 
 
-def missing(planned: Plan, turn: Pass, done: Collection[int]) -> list[tuple[int, int]]:
+def missing(planned: Plan, turn: Pass, done: Collection[int], *, ends: bool = True) -> list[tuple[int, int]]:
     """Runs of slots, first and last, of a pass that lack a shot though they could have had one.
 
-    A camera too slow for the step leaves slots empty, and so do the ends, where the head speeds up and slows down.
+    A camera too slow for the step leaves slots empty, and so may the ends, where the head speeds up and slows down.
+
+    Args:
+        ends: whether empty ends count: a sweep that was broken off may just not have come there.
     """
     base = turn.number * turn.slots
     there = sorted(index - base for index in done if base <= index < base + turn.slots)
@@ -69,7 +72,7 @@ def missing(planned: Plan, turn: Pass, done: Collection[int]) -> list[tuple[int,
         return [(0, turn.slots - 1)]
     spacing = int(np.median(np.diff(there))) if len(there) > 1 else 1
     natural = 2 * (spacing - 1)
-    ramp = math.ceil(RUN_UP_S * planned.params.speed_deg_s / planned.params.step_deg) + natural
+    ramp = natural + (0 if ends else math.ceil(RUN_UP_S * planned.params.speed_deg_s / planned.params.step_deg))
     runs = [(before + 1, after - 1) for before, after in pairwise(there) if after - before - 1 > natural]
     first = [(0, there[0] - 1)] if there[0] > ramp else []
     last = [(there[-1] + 1, turn.slots - 1)] if turn.slots - 1 - there[-1] > ramp else []
