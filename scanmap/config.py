@@ -19,7 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from scanmap.calibration import Calibration, CalibrationFile
-from scanmap.errors import CalibrationError, ConfigError
+from scanmap.errors import CalibrationError, ConfigError, in_words
 from scanmap.grid import GridParams
 from scanmap.laserline import LaserLineParams
 from scanmap.recording import RecordingParams
@@ -184,7 +184,7 @@ def _faults(error: ValidationError) -> set[str]:
     for detail in error.errors():
         path, valid = _path_and_keys(detail["loc"])
         where = ".".join(path) or "configuration"
-        message = detail["msg"].removeprefix("Value error, ")
+        message = in_words(detail["msg"])
         if detail["type"] == "extra_forbidden":
             extra.add(f"{where} is no key here; valid: {', '.join(valid)}")
         elif isinstance(detail["input"], float) and not math.isfinite(detail["input"]):

@@ -31,3 +31,10 @@ class RecordingError(ScanmapError):
 
 class RegistrationError(ScanmapError):
     """Two stations could not be brought into one frame."""
+
+
+def in_words(message: str) -> str:
+    """What pydantic says is wrong with a value, in the words of this program."""
+    for theirs, ours in (("Value error, ", ""), ("Input should", "must"), ("an object", "a table")):
+        message = message.replace(theirs, ours)
+    return "is missing" if message == "Field required" else message

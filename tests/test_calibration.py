@@ -146,7 +146,7 @@ def test_a_plane_of_any_length_and_sign_is_the_same_plane(scale):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (("fx = 1265.4749", ""), ["intrinsics.fx: Field required"]),
+        (("fx = 1265.4749", ""), ["intrinsics.fx: is missing"]),
         (("fx = 1265.4749", "fx = -3.0"), ["intrinsics.fx = -3.0", "greater than 0"]),
         (("fx = 1265.4749", 'fx = "wide"'), ["intrinsics.fx = 'wide'", "number"]),
         (("fx = 1265.4749", 'fx = "1265"'), ["intrinsics.fx = '1265'", "number"]),

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field, FiniteFloat, ValidationError, field_valid
 
 from scanmap.calibration.camera import Intrinsics
 from scanmap.calibration.head import Calibration, PixelAngleModel, RatioModel
-from scanmap.errors import CalibrationError
+from scanmap.errors import CalibrationError, in_words
 from scanmap.geometry import HeadMount, is_rotation, rigid, rotation_z
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def _faults(error: ValidationError) -> list[str]:
     faults = []
     for detail in error.errors():
         where = ".".join(str(part) for part in detail["loc"]) or "file"
-        message = detail["msg"].removeprefix("Value error, ")
+        message = in_words(detail["msg"])
         if detail["type"] == "extra_forbidden":
             table: Any = CalibrationFile
             for part in detail["loc"][:-1]:

@@ -27,7 +27,7 @@ from scanmap.cli import (
     tabling,
     terminal,
 )
-from scanmap.errors import ConfigError, ScanmapError
+from scanmap.errors import ConfigError, ScanmapError, in_words
 
 app = typer.Typer(
     name="scanmap",
@@ -121,4 +121,4 @@ def _usage(error: Exception) -> str:
     command = context.command_path if context is not None else "scanmap"
     valid = ", ".join(getattr(context.command, "commands", ())) if context is not None else ""
     commands = f"; commands: {valid}" if valid else ""
-    return f"{str(say_it()).rstrip('.')}{commands}; try {command} --help"
+    return f"{in_words(str(say_it()).rstrip('.'))}{commands}; try {command} --help"
