@@ -54,8 +54,16 @@ def noise_variance(residual: F32, weight: F32, fitted: F32 | float, parts: Seque
     return variance
 
 
-def speckle_contrasts(residual: F32, signal: F32, weight: F32, rows: Rows) -> F64:
-    """Speckle contrast of each picture (P,): how much the scatter between neighbouring rows grows with the signal."""
+def speckle_contrasts(residual: F32, bell: F32, height: F32, weight: F32, rows: Rows) -> F64:
+    """Speckle contrast of each picture (P,): how much the scatter between neighbouring rows grows with the signal.
+
+    Args:
+        residual: (n, N) what the fit leaves over.
+        bell: (n, N) the fitted profiles, of height 1.
+        height: (N,) of the lines.
+        weight: (n, N) of the samples.
+        rows: which pictures they are of.
+    """
     contrast = np.zeros(len(rows.noise_of))
     # Some rows tell where there is none.
     quick = [np.arange(p.start, p.stop, max(1, (p.stop - p.start) // _TELLING)) for p in rows.parts]
@@ -69,22 +77,24 @@ def speckle_contrasts(residual: F32, signal: F32, weight: F32, rows: Rows) -> F6
             asked.append(k)
     if asked:
         contrast[asked] = _speckle_contrasts(
-            residual, signal, weight, [rows.parts[k] for k in asked], rows.noise_of[asked]
+            residual, bell, height, weight, [rows.parts[k] for k in asked], rows.noise_of[asked]
         )
     return contrast
 
 
-def _speckle_contrasts(residual: F32, signal: F32, weight: F32, parts: Sequence[slice], noise: F64) -> list[float]:
+def _speckle_contrasts(
+    residual: F32, bell: F32, height: F32, weight: F32, parts: Sequence[slice], noise: F64
+) -> list[float]:
     """Speckle contrasts of some pictures.
 
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
     pairs = [np.arange(p.start, p.stop - 1, max(1, (p.stop - p.start) // _TELLING_PAIRS)) for p in parts]
     upper = np.concatenate(pairs)
-    (left, right), (a, b), (u, v) = (
-        (values.take(upper, axis=1), values.take(upper + 1, axis=1)) for values in (residual, signal, weight)
-    )
-    step, level, core = right - left, np.minimum(a, b), u * v
+    lower = upper + 1
+    step = residual.take(lower, axis=1) - residual.take(upper, axis=1)
+    level = np.minimum(bell.take(upper, axis=1) * height[upper], bell.take(lower, axis=1) * height[lower])
+    core = weight.take(upper, axis=1) * weight.take(lower, axis=1)
     core *= level > np.float32(0.4) * level.max(axis=0, initial=0.0)
     count, scatter, power = core.sum(axis=0), dot(core * step, step), dot(core * level, level)
     contrasts, first = [], 0

@@ -102,7 +102,7 @@ def fit_gaussian(
         look.weight[:, part] = usable.take(part, axis=1) * near(x, fit.of(part), REACH, least)
     unknown = np.isnan(contrast)
     if unknown.any():
-        judged = speckle_contrasts(look.residual, fit.A * look.bell, look.weight, rows)
+        judged = speckle_contrasts(look.residual, look.bell, fit.A, look.weight, rows)
         contrast = np.where(unknown, judged, contrast)
     peaks = _peaks(fit, look, clipped, cut, rows, dim)._replace(contrast=contrast)
     speckled = not_one((contrast[rows.picture] > SPECKLE_FROM).nonzero()[0])
