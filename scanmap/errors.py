@@ -25,6 +25,10 @@ class CalibrationError(ScanmapError):
     """A calibration is damaged, does not fit the images, or could not be solved."""
 
 
+class CalibrationFileError(CalibrationError, ConfigError):
+    """A calibration file that was named is missing, damaged or something else; exit code 2."""
+
+
 class RecordingError(ScanmapError):
     """A recording or data file cannot be read or written."""
 

@@ -269,3 +269,18 @@ def test_random_poses_are_in_the_picture() -> None:
     pixels = seen(HEAD, CHESS.points @ T[:3, :3].T + T[:3, 3])
     assert (pixels > 0).all()
     assert (pixels < [HEAD.width, HEAD.height]).all()
+
+
+def test_a_charuco_board_with_fewer_rows_than_named_is_refused() -> None:
+    """Its markers are numbered as those of the longer one: only rows that never show tell."""
+    board, longer = parse_board("charuco:7x5:30mm:22mm"), parse_board("charuco:7x6:30mm:22mm")
+    rng = np.random.default_rng(5)
+    shown = [
+        Picture(str(k), picture_of(HEAD, board, in_front(board, (tilt, -tilt, 0.5)), rng))
+        for k, tilt in enumerate((-0.2, -0.1, 0.0, 0.1, 0.2))
+    ]
+    collect(shown, board).require()
+    with pytest.raises(CalibrationError, match="use --board charuco:7x5:30mm:22mm if that is all it has"):
+        collect(shown, longer).require()
+    # One or two pictures without its last row may be a hand's doing.
+    collect(shown[:2], longer).require()

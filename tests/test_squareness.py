@@ -111,7 +111,7 @@ def test_bearings_seen_twice_are_as_good_as_more_of_them() -> None:
     """Forward and back, each picture with an error of its own: the same pieces, a smaller error left."""
     there = np.arange(0.0, 181.0, 3.0)
     once, twice = (
-        refine(room_seen(SQUARE, CUPBOARDS, 1, 0.006, bearings), head(300, MOUNT), any_gain=True)
+        refine(room_seen(SQUARE, CUPBOARDS, 1, 0.006, bearings), head(300, MOUNT))
         for bearings in (there, np.append(there, there[::-1]))
     )
     assert len(twice.segments) <= len(once.segments) + 1 and twice.patches.column_px.shape[0] == len(there)

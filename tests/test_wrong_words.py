@@ -69,7 +69,7 @@ def test_usage(run: Run, words: str, complaint: str) -> None:
 
 def test_a_rigs_toml_is_no_calibration(run: Run) -> None:
     code, _, err = run("scan", "--calibration", "rig.toml")
-    assert code == 1 and err.count("\n") == 1
+    assert code == 2 and err.count("\n") == 1
     assert "rig.toml is the configuration of a rig, not a calibration: give it with --config" in err
 
 

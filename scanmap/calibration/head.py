@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.calibration.camera import Intrinsics
-from scanmap.errors import CalibrationError
+from scanmap.errors import CalibrationError, CalibrationFileError
 from scanmap.geometry import HeadMount
 
 Array = NDArray[np.float64]
@@ -120,14 +120,17 @@ class Calibration:
         """Read a calibration.toml.
 
         Raises:
-            CalibrationError: missing, not TOML, or a field is missing or wrong; every fault is named.
+            CalibrationFileError: missing, not TOML, or a field is missing or wrong; every fault is named.
         """
         try:
             text = Path(path).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-            raise CalibrationError(f"calibration {path} cannot be read: {why}") from error
-        return cls.loads(text, source=str(path))
+            raise CalibrationFileError(f"calibration {path} cannot be read: {why}") from error
+        try:
+            return cls.loads(text, source=str(path))
+        except CalibrationError as error:
+            raise CalibrationFileError(str(error)) from error
 
     @classmethod
     def loads(cls, text: str, source: str = "calibration") -> Calibration:

@@ -75,9 +75,16 @@ def self_(
         heads = (("before", refined.before), ("after", refined.after))
         write_walls(rrd, [in_space(name, head, refined.segments, refined.patches) for name, head in heads])
         say(f"wrote {rrd}")
+    again = f"{shlex.quote(str(recording))}{_again(config, set_)}"
+    if not refined.gained:
+        say(
+            "nothing to gain: the change is within its own sigma, the head is as good as this scan can tell; nothing "
+            f"is written. Use it as it is; scanmap calibrate check {again}{_given(calibration)} judges it"
+        )
+        return
     kept = write_refined(refined, out, recording, is_twin=is_twin)
     say_written(out, kept)
-    files = f"{shlex.quote(str(recording))}{_again(config, set_)} --calibration {shlex.quote(str(out))}"
+    files = f"{again}{_given(str(out))}"
     say(f"next: scanmap calibrate check {files}")
     say(f"next: scanmap replay {files} --out room.ply")
 
@@ -132,9 +139,8 @@ def check(
         say(f"wrote {rrd}")
     if not judged.passed:
         say(
-            f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}"
-            + (f" --calibration {shlex.quote(calibration)}" if calibration is not None else "")
-            + ", or with a board: scanmap calibrate laser"
+            f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}{_given(calibration)}"
+            ", or with a board: scanmap calibrate laser"
         )
         raise typer.Exit(1)
 
@@ -143,6 +149,11 @@ def _again(config: str | None, set_: list[str] | None) -> str:
     """The options that a following command needs too."""
     options = [] if config is None else [f" --config {shlex.quote(config)}"]
     return "".join([*options, *(f" --set {shlex.quote(one)}" for one in set_ or ())])
+
+
+def _given(calibration: str | None) -> str:
+    """The option that names a calibration, where there is one."""
+    return "" if calibration is None else f" --calibration {shlex.quote(calibration)}"
 
 
 def _measure(

@@ -73,7 +73,7 @@ def write_refined(refined: Refined, out: Path, recording: Path, *, is_twin: bool
     Raises:
         CalibrationError: it cannot be written, or it was not better.
     """
-    if not refined.rms_after_px < refined.rms_before_px:
+    if not refined.gained:
         raise CalibrationError("nothing is written: the calibration is no better than the one before")
     stale = {"laser_rms_px", *(("axis_rms_px",) if refined.scale == "baseline" else ())}
     residuals = {key: value for key, value in refined.after.residuals.items() if key not in stale}

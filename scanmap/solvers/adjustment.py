@@ -6,7 +6,8 @@ What limits such a fit is not a patch's noise but what patches have in common: a
 off alike, by JPEG's blocks and the lens's glare, and comes again wherever the line stands in the same column. A shot's
 patches on one piece therefore count about once (their weights say so), and the covariance is that of this weighting
 under errors so shared (the sandwich of Huber 1967). Either way of sharing is counted in full, for planes fitted to such
-errors hide some of them.
+errors hide some of them. What is seen again at the same place of the picture has all its error again, so a line that
+stands still while the head turns, on a level floor or on something that does not turn, is one measurement.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
 from scanmap.solvers.flat_segments import Segments
-from scanmap.solvers.freedom import changed
+from scanmap.solvers.freedom import Freedom
 from scanmap.solvers.own_planes import Pieces, azimuth_influence, beside_own_planes, leans
 from scanmap.solvers.sight import Patches, Sight, located
 from scanmap.solvers.squareness import Upright
@@ -44,27 +45,31 @@ class Shared:
 
     own_px: Array  # (N,) a patch's own noise
     shared_px: Array  # (N,) what it has in common with others
+    place: Index  # (N,) where in the picture
     cluster: Index  # (N,) one shot on one piece
     column: Index  # (N,) where the line stands
 
     def spread(self, influence: Array) -> Array:
         """Covariance (P, P) of sums over patches of influence (N, P) times error."""
-        whole = (influence * self.own_px[:, None] ** 2).T @ influence
-        for group in (self.cluster, self.column):
-            sums = _sums(group, influence * self.shared_px[:, None])
-            whole = whole + sums.T @ sums
-        return np.asarray(whole)
+        whole = np.zeros((influence.shape[1], influence.shape[1]))
+        for group, size in (
+            (self.place, self.own_px), (self.cluster, self.shared_px), (self.column, self.shared_px),
+        ):  # fmt: skip
+            sums = _sums(group, influence * size[:, None])
+            whole += sums.T @ sums
+        return whole
 
     def spread_of_pieces(self, influence: Array, piece: Index) -> Array:
         """Variances (K,) of the same sums over the patches of each piece, influence (N,)."""
-        whole = np.bincount(piece, (influence * self.own_px) ** 2)
-        _, here = np.unique(piece * (self.column.max() + 1) + self.column, return_inverse=True)
-        for group in (self.cluster, here):
-            owner = np.zeros(group.max() + 1, np.intp)
-            owner[group] = piece
-            sums = np.bincount(group, influence * self.shared_px)
-            whole = whole + np.bincount(owner, sums**2, minlength=len(whole))
-        return np.asarray(whole)
+        whole = np.zeros(piece.max() + 1)
+        for group, size in (
+            (self.place, self.own_px), (self.cluster, self.shared_px), (self.column, self.shared_px),
+        ):  # fmt: skip
+            _, here = np.unique(piece * (group.max() + 1) + group, return_inverse=True)
+            owner = np.zeros(here.max() + 1, np.intp)
+            owner[here] = piece
+            whole += np.bincount(owner, np.bincount(here, influence * size) ** 2, minlength=len(whole))
+        return whole
 
 
 @dataclass(frozen=True)
@@ -83,18 +88,18 @@ class Adjustment:
 
     sight: Sight  # N patches
     column: Index  # (N,) in steps of SAME_COLUMN_PX
+    place: Index  # (N,) the same of the same row
     pieces: Pieces
     cluster: Index  # (N,) one shot on one piece
     walls: Index  # large pieces that stand upright
     floors: Index  # and that lie
     calibration: Calibration
-    free: tuple[str, ...]
-    ruler: Array  # (P,)
+    free: Freedom
 
     @classmethod
     def of(
         cls, sight: Sight, patches: Patches, segments: Segments, clear: NDArray[np.bool_], calibration: Calibration,
-        free: tuple[str, ...], ruler: Array,
+        free: Freedom,
     ) -> Adjustment:  # fmt: skip
         """Of what lies on flat pieces and is `clear` (B, R) of their edges."""
         label = segments.label.ravel()
@@ -106,12 +111,13 @@ class Adjustment:
         numbers, piece = np.unique(label[where], return_inverse=True)
         _, cluster = np.unique(piece * segments.label.shape[0] + where // segments.label.shape[1], return_inverse=True)
         _, column = np.unique(np.round(patches.column_px.ravel()[where] / SAME_COLUMN_PX), return_inverse=True)
+        _, place = np.unique(column * segments.label.shape[1] + where % segments.label.shape[1], return_inverse=True)
         pieces = Pieces(piece, np.searchsorted(piece, np.arange(len(numbers))), segments.planes[numbers, :3])
         large = np.argsort(-np.bincount(piece))[:LARGEST_PIECES]
         lean = np.abs(pieces.normals[large, 2])
         return cls(
-            Sight(*(part.reshape(-1, *part.shape[2:])[where] for part in sight)), column, pieces, cluster,
-            large[lean < np.sin(UPRIGHT_WITHIN)], large[lean > np.cos(UPRIGHT_WITHIN)], calibration, free, ruler,
+            Sight(*(part.reshape(-1, *part.shape[2:])[where] for part in sight)), column, place, pieces, cluster,
+            large[lean < np.sin(UPRIGHT_WITHIN)], large[lean > np.cos(UPRIGHT_WITHIN)], calibration, free,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -128,19 +134,20 @@ class Adjustment:
         from scipy.optimize import least_squares
 
         weight = np.ones(len(self.cluster))
+        again, together = (np.bincount(group)[group] for group in (self.place, self.cluster))
         for _ in range(rounds):
             off, lean = self.residual(change, weight)
             shared = self._shared(off)
             own = shared.own_px
             robust = 1.0 / (1.0 + (off / (2.0 * own)) ** 2)
-            weight = robust / (own**2 + np.bincount(self.cluster)[self.cluster] * shared.shared_px**2)
+            weight = robust / (again * own**2 + together * shared.shared_px**2)
             steady = 1.0 / np.sqrt(1.0 + (lean / 2.0) ** 2)
 
             def weighed(x: Array, weight: Array = weight, steady: Array = steady) -> Array:
                 off, lean = self.residual(x, weight)
-                return np.concatenate([off * np.sqrt(weight), lean * steady, x / self.ruler])
+                return np.concatenate([off * np.sqrt(weight), lean * steady, x / self.free.ruler])
 
-            found = least_squares(weighed, change, x_scale=self.ruler, max_nfev=12, ftol=1e-6, xtol=1e-6)
+            found = least_squares(weighed, change, x_scale=self.free.ruler, max_nfev=12, ftol=1e-6, xtol=1e-6)
             change = found.x
         count = len(self.cluster)
         bread = np.linalg.inv(found.jac.T @ found.jac)
@@ -155,7 +162,7 @@ class Adjustment:
         which = np.flatnonzero(np.abs(normals[:, 2]) < np.sin(UPRIGHT_WITHIN))
         here = _azimuth(normals[which])
         slope = []
-        for step in SLOPE_STEP * np.eye(len(self.free)):
+        for step in SLOPE_STEP * np.eye(len(self.free.names)):
             moved = beside_own_planes(*self._located(solution.change + step), solution.weight, self.pieces)[1]
             # A normal found the other way round turned by 180 deg.
             turned = _azimuth(moved[which]) - here
@@ -165,7 +172,7 @@ class Adjustment:
         return Upright(here, np.stack(slope, axis=1), sigma[which])
 
     def _located(self, change: Array) -> tuple[Array, Array]:
-        return located(self.sight, changed(self.calibration, self.free, change))
+        return located(self.sight, self.free.changed(self.calibration, change))
 
     def _shared(self, off: Array) -> Shared:
         """How much patches scatter, and how much of it those of one shot on one piece have in common.
@@ -189,7 +196,7 @@ class Adjustment:
         ])  # fmt: skip
         return Shared(
             np.maximum(scatter, max(0.3 * whole, NOISE_FLOOR_PX))[piece],
-            np.sqrt(np.maximum(common, NOISE_FLOOR_PX**2))[piece], cluster, self.column,
+            np.sqrt(np.maximum(common, NOISE_FLOOR_PX**2))[piece], self.place, cluster, self.column,
         )  # fmt: skip
 
 

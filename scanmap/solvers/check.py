@@ -81,12 +81,11 @@ class Check:
         """What self-calibration changes beyond all that was promised."""
         if self.refined is None or self.refined.rms_before_px < CHANGE_GAIN * self.refined.rms_after_px:
             return []
-        promised = {"offset_x": "offset_x", "offset_y": "offset_y", "tilt_x": "tilt_x", "tilt_y": "tilt_y",
-                    "yaw": "plane_nx", "roll": "plane_nz", "distance": "plane_d"}  # fmt: skip
+        promised = {"yaw": "plane_nx", "roll": "plane_nz", "distance": "plane_d", "aside": "offset_y"}
         return [
             e for e in self.refined.estimates
             if e.observed and abs(e.change) > CHANGE_DEVIATIONS * np.hypot(
-                e.sigma, self.known.sigma(promised[e.name]) if self.known is not None else 0.0)
+                e.sigma, self.known.sigma(promised.get(e.name, e.name)) if self.known is not None else 0.0)
         ]  # fmt: skip
 
     @property
@@ -117,7 +116,7 @@ def check(
     sight = sight_of(patches, calibration.intrinsics)
     points, per_column = located(sight, calibration)
     try:
-        refined: Refined | None = refine(lines, calibration, any_gain=True, progress=progress)
+        refined: Refined | None = refine(lines, calibration, progress=progress)
     except CalibrationError:
         refined = None
     segments = refined.segments if refined else grow(points, per_column, patches, params.tolerance_px)

@@ -73,10 +73,9 @@ def grow(points: Array, per_column: Array, patches: Patches, tolerance_px: float
 
 def beside(points: Array, per_column: Array, plane: Array) -> Array:
     """Columns (...,) that points (..., 3) lie beside their plane (4,) or (..., 4), signed along the image."""
-    normal = plane[..., :3]
-    along = (per_column * normal).sum(axis=-1)
-    steep = np.where(along >= 0, 1.0, -1.0) * np.maximum(np.abs(along), FLOOR_M_PER_PX)
-    columns: Array = ((points * normal).sum(axis=-1) + plane[..., 3]) / steep
+    along, height = (np.einsum("...i,...i->...", part, plane[..., :3]) for part in (per_column, points))
+    steep = np.copysign(np.maximum(np.abs(along), FLOOR_M_PER_PX), along)
+    columns: Array = (height + plane[..., 3]) / steep
     return columns
 
 

@@ -2,30 +2,33 @@
 
 Flat walls stay flat when the whole scan is scaled, turned about the axis or lifted along it. So of the seven ways in
 which laser plane and axis can stand to the camera, flatness sees six; the seventh, scale, must be held by a length
-that is known: the baseline, or the axis's distance from the head.
+that is known: the baseline, or the axis's distance from the head, at the height of what is scanned.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
+from scanmap.calibration.uncertainty import uncertainty_of
 from scanmap.geometry import HeadMount, inverse, rigid, rotation_z
 
 Array = NDArray[np.float64]
 Scale = Literal["baseline", "axis"]
 
+STEP = 1e-5  # of a numerical derivative [rad] or [m]
+
 # Changes: the plane turned by yaw and roll about the camera's centre [rad] and moved away from it [m]; the head's
-# offset from the axis [m]; the axis's tilt [rad].
-NAMES = ("yaw", "roll", "distance", "offset_x", "offset_y", "tilt_x", "tilt_y")
+# offset from the axis [m], along x and y or aside, which keeps its length; the axis's tilt [rad].
+NAMES = ("yaw", "roll", "distance", "offset_x", "offset_y", "aside", "tilt_x", "tilt_y")
 FREE: dict[Scale, tuple[str, ...]] = {
     "baseline": ("yaw", "roll", "offset_x", "offset_y", "tilt_x", "tilt_y"),
-    "axis": ("yaw", "roll", "distance"),
+    "axis": ("yaw", "roll", "distance", "aside", "tilt_x", "tilt_y"),
 }
 # How well a head is known before, by ruler and printed parts (one standard deviation); what a scan cannot see stays.
 RULER: dict[Scale, dict[str, float]] = {
@@ -33,7 +36,11 @@ RULER: dict[Scale, dict[str, float]] = {
         "yaw": np.radians(1.0), "roll": np.radians(0.3), "offset_x": 0.03, "offset_y": 0.015,
         "tilt_x": np.radians(0.3), "tilt_y": np.radians(0.3),
     },
-    "axis": {"yaw": np.radians(1.0), "roll": np.radians(1.0), "distance": 0.01},
+    # A turntable is no printed part of the head: how it leans is told from pictures, to half a degree.
+    "axis": {
+        "yaw": np.radians(1.0), "roll": np.radians(1.0), "distance": 0.01, "aside": 0.005,
+        "tilt_x": np.radians(0.5), "tilt_y": np.radians(0.5),
+    },
 }  # fmt: skip
 
 
@@ -50,20 +57,72 @@ def tangents(normal: Array) -> tuple[Array, Array]:
     return first, np.cross(normal, first)
 
 
-def changed(calibration: Calibration, names: Sequence[str], values: Array) -> Calibration:
-    """The head with some of `NAMES` changed; its camera stays where it is, laser plane and mount move."""
+class Freedom(NamedTuple):
+    """What may move in one head, and how far."""
+
+    names: tuple[str, ...]  # P of `NAMES`
+    ruler: Array  # (P,) one standard deviation of each before
+    pivot_m: float | None  # height of the axis' point about which it tilts; the head's origin if None
+
+    @classmethod
+    def of(cls, calibration: Calibration, scale: Scale, height_m: float) -> Freedom:
+        """All that flatness can see beside `scale`, which holds at the height of what is scanned.
+
+        A turntable's axis may be known better than by ruler: `calibrate axis` says how well.
+        """
+        ruler = dict(RULER[scale])
+        known = uncertainty_of(calibration)
+        if scale == "axis" and known is not None:
+            for name, said in (("aside", "offset_y"), ("tilt_x", "tilt_x"), ("tilt_y", "tilt_y")):
+                ruler[name] = min(ruler[name], known.sigma(said) or ruler[name])
+        names = FREE[scale]
+        return cls(names, np.array([ruler[name] for name in names]), height_m if scale == "axis" else None)
+
+    def changed(self, calibration: Calibration, change: Array) -> Calibration:
+        """The head with a change (P,) in it."""
+        return changed(calibration, self.names, change, self.pivot_m)
+
+    def slope(self, calibration: Calibration) -> Array:
+        """Derivative (8, P) of laser plane, offset x and y [m], tilt x and y [rad] by the changes."""
+
+        def numbers(change: Array) -> Array:
+            head = self.changed(calibration, change)
+            return np.concatenate([head.laser_plane, head.mount.offset_m[:2], np.radians(head.mount.tilt_deg)])
+
+        steps = STEP * np.eye(len(self.names))
+        return np.stack([(numbers(step) - numbers(-step)) / (2.0 * STEP) for step in steps], axis=1)
+
+
+def changed(calibration: Calibration, names: Sequence[str], values: Array, pivot_m: float | None = None) -> Calibration:
+    """The head with some of `NAMES` changed; its camera stays where it is, laser plane and mount move.
+
+    Args:
+        pivot_m: height in the world of that point of the axis about which it tilts; the head's origin if left out.
+    """
     change = dict.fromkeys(NAMES, 0.0) | dict(zip(names, map(float, values), strict=True))
     normal, centre = calibration.laser_plane[:3], calibration.T_head_camera[:3, 3]
     away = normal @ centre + calibration.laser_plane[3] + change["distance"]
     first, second = tangents(normal)
     turned = normal + change["yaw"] * first + change["roll"] * second
     turned /= np.linalg.norm(turned)
-    (x, y, z), (tilt_x, tilt_y) = calibration.mount
-    mount = HeadMount(
-        (x + change["offset_x"], y + change["offset_y"], z),
-        (tilt_x + float(np.degrees(change["tilt_x"])), tilt_y + float(np.degrees(change["tilt_y"]))),
-    )
+    mount = _moved(calibration.mount, change, pivot_m)
     return replace(calibration, laser_plane=np.append(turned, away - turned @ centre), mount=mount)
+
+
+def _moved(mount: HeadMount, change: dict[str, float], pivot_m: float | None) -> HeadMount:
+    """The mount with offset and tilt changed."""
+    offset = np.array(mount.offset_m)
+    tilt_x, tilt_y = (
+        mount.tilt_deg[k] + float(np.degrees(change[name])) for k, name in enumerate(("tilt_x", "tilt_y"))
+    )
+    if pivot_m is not None:
+        arm = offset - [0.0, 0.0, pivot_m]
+        before, after = (m.T_axis_head()[:3, :3] for m in (mount, HeadMount(mount.offset_m, (tilt_x, tilt_y))))
+        offset = offset + after @ before.T @ arm - arm
+    offset[:2] += change["offset_x"], change["offset_y"]
+    if change["aside"]:
+        offset[:2] += change["aside"] * np.array([-offset[1], offset[0]]) / np.hypot(*offset[:2])
+    return HeadMount((float(offset[0]), float(offset[1]), float(offset[2])), (tilt_x, tilt_y))
 
 
 def redrawn(calibration: Calibration, laser_plane: Array) -> Calibration:
@@ -85,18 +144,6 @@ def redrawn(calibration: Calibration, laser_plane: Array) -> Calibration:
     return replace(
         calibration, T_head_camera=T_new_old @ calibration.T_head_camera, laser_plane=laser_plane.copy(), mount=mount
     )
-
-
-def plane_slope(calibration: Calibration, names: Sequence[str]) -> Array:
-    """Derivative (4, N) of the laser plane by the changes `names`."""
-    normal, centre = calibration.laser_plane[:3], calibration.T_head_camera[:3, 3]
-    first, second = tangents(normal)
-    columns = {
-        "yaw": np.append(first, -first @ centre),
-        "roll": np.append(second, -second @ centre),
-        "distance": np.array([0.0, 0.0, 0.0, 1.0]),
-    }
-    return np.stack([columns.get(name, np.zeros(4)) for name in names], axis=1)
 
 
 def _turn_about(centre: Array, source: Array, target: Array) -> Array:

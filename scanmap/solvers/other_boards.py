@@ -23,6 +23,8 @@ MARKERS_LEAST, LAYOUT_LEAST = 4, 6
 # [share of the distance between markers] how far they may lie from where a layout has them.
 LAYOUT_OFF = 0.15
 SQUARES_MOST = 24
+# So many pictures must have room for a row that none of them shows.
+MISSED_LEAST = 4
 FAMILIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
 )  # fmt: skip
@@ -107,6 +109,33 @@ def wrong_size(board: Board, views: Sequence[View], rejected: Sequence[Rejected]
     return (
         f"no picture shows all of {board.name}, at most {size[0]}x{size[1]} inner corners: show all of it once, or use "
         f"--board {_named(size, board)} if that is all it has"
+    )
+
+
+def rows_too_many(board: Board, views: Sequence[View], size: tuple[int, int]) -> str:
+    """Why a ChArUco board has fewer rows than was named; empty if it may have them.
+
+    Its markers are counted row by row, so a shorter print looks like a board whose last rows never show. That they
+    are cut off or covered in every picture is unlikely where their places lie within the pictures (W, H).
+    """
+    if board.kind != "charuco" or not views:
+        return ""
+    across, down = board.corners
+    last = max(int(view.ids.max()) for view in views) // across
+    if last + 1 >= down:
+        return ""
+    places = board.points[(last + 1) * across : (last + 2) * across, :2][:, None]
+    missed = 0
+    for view in views:
+        H, _ = cv2.findHomography(board.points[view.ids, :2], view.corners)
+        next_row = cv2.perspectiveTransform(places, H)[:, 0] if H is not None else np.full((across, 2), np.nan)
+        inside = ((next_row > 0) & (next_row < np.array(size) - 1)).all(axis=1)
+        missed += bool(inside.all()) and int((view.ids // across == last).sum()) > across // 2
+    if missed < MISSED_LEAST:
+        return ""
+    return (
+        f"no picture shows more than {last + 2} rows of squares of {board.name}, and {missed} have room for them: use "
+        f"--board {_named((board.columns, last + 2), board)} if that is all it has, else show all of it once"
     )
 
 

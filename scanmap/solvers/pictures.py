@@ -19,7 +19,7 @@ from scanmap.shot import Image, Shot, decode_image
 from scanmap.solvers.board import Board
 from scanmap.solvers.coverage import apart, is_new
 from scanmap.solvers.detection import Rejected, View, find_board
-from scanmap.solvers.other_boards import seen_instead, wrong_size
+from scanmap.solvers.other_boards import rows_too_many, seen_instead, wrong_size
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Views:
                 f"{self.board.name} is in {len(self.views)} of {len(self.views) + len(self.rejected)} pictures only: "
                 f"{self.instead}"
             )
-        fault = wrong_size(self.board, self.views, self.rejected)
+        fault = wrong_size(self.board, self.views, self.rejected) or rows_too_many(self.board, self.views, self.size)
         if fault:
             raise CalibrationError(fault)
         if self.views:

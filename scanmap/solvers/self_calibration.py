@@ -20,7 +20,7 @@ from scanmap.calibration.uncertainty import PLANE, Uncertainty, uncertainty_of
 from scanmap.errors import CalibrationError
 from scanmap.solvers.adjustment import Adjustment
 from scanmap.solvers.flat_segments import Segments, grow, near_another
-from scanmap.solvers.freedom import FREE, RULER, Scale, changed, longer_length, plane_slope, redrawn
+from scanmap.solvers.freedom import Freedom, Scale, longer_length, redrawn
 from scanmap.solvers.sight import Lines, Patches, located, patches_of, sight_of
 from scanmap.solvers.squareness import Squared, squared
 
@@ -32,8 +32,14 @@ REWEIGHTED = 4  # times a round; with fewer, where it ends depends on where it b
 FEWEST_PIECES = 3
 # A parameter is observed if the scan knows it at least this much better than the ruler.
 OBSERVED = 0.5
+# A change is beyond chance from so many deviations of chi-square on.
+CHANCE = 3.0
 # A head farther off than this many ruler's deviations is not refined but wrong.
 FARTHEST = 3.5
+# What a scan must tell, or it tells nothing.
+MUST: dict[Scale, tuple[str, ...]] = {
+    "baseline": ("yaw", "offset_x", "offset_y"), "axis": ("yaw", "roll", "distance"),
+}  # fmt: skip
 NO_AXIS = (
     ". This calibration has no axis yet: write the head's offset from it, by a ruler, as head_offset_m under [axis], "
     "or run scanmap calibrate axis"
@@ -63,6 +69,7 @@ class Refined:
     rms_before_px: float  # of the same pieces, in image columns
     rms_after_px: float
     square: Squared  # what the walls' directions added
+    gained: bool  # whether walls are flatter after, by a change beyond chance
 
     def estimate(self, name: str) -> Estimate:
         """One of the parameters by its name."""
@@ -70,7 +77,7 @@ class Refined:
 
 
 def refine(
-    lines: Lines, calibration: Calibration, scale: Scale | None = None, *, any_gain: bool = False,
+    lines: Lines, calibration: Calibration, scale: Scale | None = None, *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Refined:  # fmt: skip
     """Refine a head from the laser lines of one scan of a room, or of a block on a turntable.
@@ -79,7 +86,6 @@ def refine(
         lines: of all shots, laser on anything flat.
         calibration: the head as it is known; its intrinsics stay.
         scale: the length that holds the scale; the longer one if left out.
-        any_gain: give the result even where the head was as good before.
         progress: told after every round how many of how many are done.
 
     Raises:
@@ -98,13 +104,14 @@ def refine(
         )
     scale = scale or longer_length(calibration)
     sight = sight_of(patches, calibration.intrinsics)
-    free, ruler = FREE[scale], np.array([RULER[scale][name] for name in FREE[scale]])
-    change, tolerance = np.zeros(len(free)), START_TOLERANCE_PX
+    height = located(sight, calibration)[0][..., 2]
+    free = Freedom.of(calibration, scale, float(np.median(np.append(height[np.isfinite(height)], 0.0))))
+    change, tolerance = np.zeros(len(free.names)), START_TOLERANCE_PX
     for done in range(1, ROUNDS + 1):
-        points, per_column = located(sight, changed(calibration, free, change))
+        points, per_column = located(sight, free.changed(calibration, change))
         segments = grow(points, per_column, patches, tolerance)
         clear = ~near_another(points, per_column, segments, 2.0 * tolerance)
-        adjustment = Adjustment.of(sight, patches, segments, clear, calibration, free, ruler)
+        adjustment = Adjustment.of(sight, patches, segments, clear, calibration, free)
         if len(adjustment) < FEWEST_PIECES:
             raise CalibrationError(
                 f"only {len(adjustment)} flat pieces found (3 at least): point the scanner at walls, floor and "
@@ -115,8 +122,8 @@ def refine(
         if progress is not None:
             progress(done, ROUNDS)
     square = squared(adjustment.upright(solution), solution.covariance)
-    outcome = _Outcome(calibration, scale, free, ruler, change + square.change, square)
-    return _judged(outcome, (adjustment, solution.weight), segments, patches, any_gain)
+    outcome = _Outcome(calibration, scale, free, change + square.change, square)
+    return _judged(outcome, (adjustment, solution.weight), segments, patches)
 
 
 @dataclass(frozen=True)
@@ -125,8 +132,7 @@ class _Outcome:
 
     calibration: Calibration
     scale: Scale
-    free: tuple[str, ...]
-    ruler: Array
+    free: Freedom
     change: Array
     square: Squared
 
@@ -135,17 +141,14 @@ class _Outcome:
         return self.square.covariance
 
 
-def _judged(
-    outcome: _Outcome, fit: tuple[Adjustment, Array], segments: Segments, patches: Patches, any_gain: bool
-) -> Refined:
+def _judged(outcome: _Outcome, fit: tuple[Adjustment, Array], segments: Segments, patches: Patches) -> Refined:
     """The result, or why there is none."""
     sigma = np.sqrt(np.diag(outcome.covariance))
     estimates = tuple(
         Estimate(name, float(change), float(own), bool(own < OBSERVED * before))
-        for name, change, own, before in zip(outcome.free, outcome.change, sigma, outcome.ruler, strict=True)
+        for name, change, own, before in zip(outcome.free.names, outcome.change, sigma, outcome.free.ruler, strict=True)
     )
-    must = ("yaw", "offset_x", "offset_y") if outcome.scale == "baseline" else outcome.free
-    blind = [e.name for e in estimates if e.name in must and not e.observed]
+    blind = [e.name for e in estimates if e.name in MUST[outcome.scale] and not e.observed]
     if blind:
         raise CalibrationError(
             f"this scan cannot tell {', '.join(blind)}: its flat pieces leave it open. Scan a corner of a room, walls "
@@ -153,7 +156,7 @@ def _judged(
             + NO_AXIS
             * ("axis" in outcome.calibration.meta.get("uncalibrated", ()))
         )
-    far = [e.name for e, r in zip(estimates, outcome.ruler, strict=True) if abs(e.change) > FARTHEST * r]
+    far = [e.name for e, r in zip(estimates, outcome.free.ruler, strict=True) if abs(e.change) > FARTHEST * r]
     if far:
         raise CalibrationError(
             f"self-calibration would change {', '.join(far)} far more than a ruler errs: the head is not the one of "
@@ -162,21 +165,19 @@ def _judged(
             * ("axis" in outcome.calibration.meta.get("uncalibrated", ()))
         )
     before, after = (_rms(fit[0].residual(x, fit[1])[0]) for x in (np.zeros(len(outcome.change)), outcome.change))
-    if not after <= before and not any_gain:
-        raise CalibrationError(
-            f"nothing to gain: flat pieces deviate by {before:.3f} px as it is and {after:.3f} px after; nothing is "
-            "written"
-        )
+    # The change against its own covariance: chi-square with as many degrees of freedom as parameters.
+    beyond = float(outcome.change @ np.linalg.solve(outcome.covariance, outcome.change))
+    chance = len(outcome.change) + CHANCE * float(np.sqrt(2.0 * len(outcome.change)))
     return Refined(
         outcome.calibration, _finished(outcome), outcome.scale, estimates, segments, patches, before, after,
-        outcome.square,
+        outcome.square, after < before and beyond > chance,
     )  # fmt: skip
 
 
 def _finished(outcome: _Outcome) -> Calibration:
     """The calibration with the change in it, its frame drawn as before, and its covariance."""
     old = outcome.calibration
-    new = changed(old, outcome.free, outcome.change)
+    new = outcome.free.changed(old, outcome.change)
     if outcome.scale == "baseline":
         new = redrawn(new, old.laser_plane)
     return replace(new, covariance=_uncertainty(outcome, new).table())
@@ -185,11 +186,9 @@ def _finished(outcome: _Outcome) -> Calibration:
 def _uncertainty(outcome: _Outcome, new: Calibration) -> Uncertainty:
     """Covariance of laser plane and mount; what was known of other parameters, and of the scale, stays."""
     known = uncertainty_of(outcome.calibration)
-    mount = tuple(name for name in outcome.free if name.startswith(("offset", "tilt")))
-    slope = np.vstack([plane_slope(new, outcome.free), *(
-        np.eye(len(outcome.free))[[outcome.free.index(name)]] for name in mount)])  # fmt: skip
+    slope = outcome.free.slope(new)
     own = slope @ outcome.covariance @ slope.T
-    names = (*PLANE, *mount)
+    names = (*PLANE, "offset_x", "offset_y", "tilt_x", "tilt_y")
     if known is None:
         return Uncertainty(names, 0.5 * (own + own.T))
     if outcome.scale == "baseline":

@@ -25,6 +25,7 @@ _MEANING = {
     "distance": "camera to laser plane (baseline)",
     "offset_x": "head offset from the axis, x",
     "offset_y": "head offset from the axis, y",
+    "aside": "axis, aside of where it was",
     "tilt_x": "axis tilt about x",
     "tilt_y": "axis tilt about y",
 }
@@ -62,8 +63,8 @@ def scale_words(refined: Refined) -> str:
         )
     distance = 1e3 * float(np.hypot(*refined.before.mount.offset_m[:2]))
     return (
-        f"scale is held by the axis, {distance:.2f} mm from the head: flat faces stay flat at any scale; the laser "
-        "plane is refined, the axis is kept; or give --scale baseline"
+        f"scale is held by the axis, {distance:.2f} mm from the head: flat faces stay flat at any scale; or give "
+        "--scale baseline"
     )
 
 
@@ -80,14 +81,15 @@ def before_and_after(refined: Refined) -> list[tuple[Wall, Wall]]:
 
 
 def _is_length(estimate: Estimate) -> bool:
-    return estimate.name.startswith(("offset", "distance"))
+    return estimate.name in ("offset_x", "offset_y", "aside", "distance")
 
 
 def _value(head: Calibration, estimate: Estimate, changed: bool) -> float:
     """The parameter's value [m] or [rad] as the calibration's own words have it; a roll counts from where it was."""
     mount = head.mount
     return {
-        "yaw": head.beta, "distance": head.baseline_m, "roll": estimate.change if changed else 0.0,
+        "yaw": head.beta, "distance": head.baseline_m, "roll": estimate.change * changed,
+        "aside": estimate.change * changed,
         "offset_x": mount.offset_m[0], "offset_y": mount.offset_m[1],
         "tilt_x": float(np.radians(mount.tilt_deg[0])), "tilt_y": float(np.radians(mount.tilt_deg[1])),
     }[estimate.name]  # fmt: skip
