@@ -78,7 +78,7 @@ def test_a_missing_calibration_is_said_without_numbers_of_the_system(
     with pytest.raises(SystemExit) as end:
         main(["calibrate", "scale", str(tmp_path / "no.toml"), "--size", "320x240", "--out", str(tmp_path / "o.toml")])
     said = capsys.readouterr().err
-    assert end.value.code == 1
+    assert end.value.code == 2
     assert "no.toml cannot be read: No such file or directory\n" in said
 
 
