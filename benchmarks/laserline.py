@@ -14,13 +14,14 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline import LaserLineParams, find_laser_line
+from scanmap.laserline import LaserLineParams, Rounding, find_laser_line, rounding_of
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from synthetic_lines import HARD, RED, LineSpec, bound, clean, hard_frame, score
@@ -148,11 +149,12 @@ TEXTBOOK: dict[str, Callable[[U8], F64]] = {
 }
 
 
-def compressed(image: U8, quality: int, sampling: str) -> U8:
-    """The frame after JPEG."""
+def compressed(image: U8, quality: int, sampling: str) -> tuple[U8, Rounding | None]:
+    """The frame after JPEG, and what its file says of rounding."""
     factor = {"422": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422, "420": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420}[sampling]
     how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor]
-    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, how)[1], cv2.IMREAD_UNCHANGED), np.uint8)
+    data = cv2.imencode(".jpg", image, how)[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8), rounding_of(data.tobytes())
 
 
 def cpu_ms(call: Callable[[], object], repeats: int = 5) -> float:
@@ -173,9 +175,10 @@ def measure(name: str, case: Case, seeds: int, textbook: bool) -> None:
     others_ms: dict[str, list[float]] = {other: [] for other in TEXTBOOK}
     for seed in range(seeds):
         image, truth = clean(case.spec, np.random.default_rng(seed))
-        image = image if case.jpeg is None else compressed(image, *case.jpeg)
-        line = find_laser_line(image, case.params, window=case.window_px)
-        times.append(cpu_ms(lambda image=image: find_laser_line(image, case.params, window=case.window_px)))
+        image, rounding = (image, None) if case.jpeg is None else compressed(image, *case.jpeg)
+        look = partial(find_laser_line, image, case.params, window=case.window_px, rounding=rounding)
+        line = look()
+        times.append(cpu_ms(look))
         errors.append(line.column_px - truth)
         scaled.append(errors[-1] / line.sigma_px)
         for other in TEXTBOOK if textbook else ():

@@ -32,12 +32,13 @@ _WIDTHS = 2.0 ** (np.arange(-4, 13) / _STEPS)  # [px] 0.5 to 8
 _HEIGHTS = 2.0 ** (np.arange(8, 33) / _STEPS)  # [grey levels] 4 to 256
 
 
-_SHARES = (0.34, 0.42, 0.5, 0.58, 0.66, 0.75, 0.85, 1.0)  # of the laser's channel in a mixture, that are weighed up
+# Of the laser's channel in a mixture, that are weighed up; the last is best where nothing but independent noise counts.
+_SHARES = (0.34, 0.42, 0.5, 0.58, 0.66, 0.75, 0.82, 0.89)
 # How far a line moves until what is rounded of it is another error [px]: measured, 0.06 to 0.2, the less the higher the
 # line; and the frequency of what is rounded to nothing [rad/px], the lower ones being too strong, the others too weak.
 _ALIKE_PX, _WAVE = 0.1, 1.2
 _USUAL = (6, 18)  # place among widths and heights that they are weighed up for: 1.4 px, 91 grey levels
-_POOLED = 4.0  # variances of noise that pooling makes one of; it leaves what is rounded as it is
+_POOLED = 6.0  # variances of noise that pooling makes one of; it leaves what is rounded as it is
 
 
 class Rounding(NamedTuple):
