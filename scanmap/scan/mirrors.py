@@ -35,6 +35,7 @@ _OFF_AXIS_M = 0.2  # a head farther from the axis than this sees a turntable, no
 _OFFSETS_M = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, 0.04)  # of the mirror before its wall
 _PATCH_M = 0.15  # what lies in one cube of this size counts once
 _PATCHES = 20  # of upright surfaces, that must agree
+_SUPPORT = 0.15  # of all patches of an opening; where most reflects to what was not swept, a few prove nothing
 _AGREE = 0.97  # share of those that agree or deny, that must agree
 _NARROW_M = 0.2  # a surface is wide where the points at the bearings beside are no more than this nearer or farther
 
@@ -71,7 +72,8 @@ def find_mirrors(scan: Scan, params: ScanParams | None = None) -> list[Mirror]:
     for wall in walls(seen.points[seen.valid], np.nan_to_num(seen.normals[seen.valid])):
         for cells in openings(seen, wall):
             offset, agree, deny = _likeness(seen, cells, wall)
-            if agree >= _PATCHES and agree >= _AGREE * (agree + deny):
+            support = _SUPPORT * len(np.unique(_patches(seen.points[cells])))
+            if agree >= max(_PATCHES, support) and agree >= _AGREE * (agree + deny):
                 seen.valid[cells] = False
                 plane = wall - [0.0, 0.0, 0.0, offset]
                 found.append(Mirror(plane, _behind(scan, wall, cells, every, each), agree, deny))

@@ -106,7 +106,7 @@ def _rim(seen: Panorama, cells: Mask, wall: F64, height: F64) -> tuple[float, fl
             near = np.abs(seen.bearings[rim[0]] - seen.bearings[edge[0]]) * seen.distance[rim] < _APART_M
             cut.append(_cut(seen, rim, edge, wall)[near])
         ends_cut = np.concatenate(cut)
-        enough &= not axis or len(ends_cut) >= max(_ENDS, len(line))
+        enough &= not axis or len(ends_cut) >= max(_ENDS, 0.5 * len(line))  # an end may be out of view
         sharp.append(float(ends_cut.mean()) if len(ends_cut) else 1.0)
     closed = np.concatenate(on_wall)
     return (min(sharp) if enough else 0.0), float(closed.mean()) if len(closed) else 0.0
