@@ -19,6 +19,7 @@ COUNT = 6  # candidates per block
 COLOURLESS = 240  # [grey levels] from here on a sample has no colour
 _PER_LEVEL = (4, 3, 3)  # candidates at each of three resolutions, for lines of sigma 0.7 to 8 px
 _LARGE = 900  # rows from which on half the columns are enough for the finest search
+_LEAD_SHIFT = 2  # what a lead in colour counts beside brightness: a quarter
 _APART = 14  # [px] two candidates are at least this far apart: nearer ones are one line in two filters
 
 
@@ -100,9 +101,17 @@ def find_candidates(
                 elsewhere, saturated = _halved(elsewhere), saturated[:, : saturated.shape[1] // 2 * 2 : 2]
         if own.shape[1] < shape.centre:
             break
-        response = _stands_out(own, shape)
+        mean, left, right = _with_sides(own, shape)
+        brighter = np.asarray(cv2.max(left, right), np.uint16)
+        response = np.asarray(cv2.subtract(mean, brighter), np.uint16)
         if elsewhere is not None and saturated is not None:
             response = _less_elsewhere(response, _stands_out(elsewhere, shape), saturated)
+            if not level:
+                rise = cv2.subtract(mean, cv2.min(left, right))
+                leads = np.asarray(cv2.min(_leads(own, elsewhere, shape), rise), np.uint16) >> _LEAD_SHIFT
+                # Of a saturated side the lead is not known.
+                leads[brighter >= COLOURLESS * gain] = 0
+                response = np.asarray(cv2.max(response, leads), np.uint16)
         if still is not None:
             across = still[:, : scale * response.shape[1]].reshape(len(still), -1, scale)
             response[across.any(axis=2)] = 0
@@ -250,9 +259,24 @@ def _less_elsewhere(response: U16, elsewhere: U16, saturated: U8) -> U16:
     return np.asarray(cv2.subtract(response, elsewhere), np.uint16)
 
 
+def _leads(own: U16, other: U16, shape: _Filter) -> U16:
+    """How far a place's lead over the other channel stands out.
+
+    A line along an edge of brightness is outshone by the brighter side, but that side is not of its colour.
+    """
+    lead = own + np.uint16(BLOCK * 255)
+    lead -= other
+    return _stands_out(lead, shape)
+
+
 def _stands_out(values: U16, shape: _Filter) -> U16:
     """Mean over the line's width minus the brighter of its two sides, at least 0."""
-    mean = cv2.blur(values, (shape.centre, 1), borderType=cv2.BORDER_REPLICATE)
-    padded = cv2.copyMakeBorder(mean, 0, 0, shape.away, shape.away, cv2.BORDER_REPLICATE)
-    side = cv2.max(padded[:, : -2 * shape.away], padded[:, 2 * shape.away :])
-    return np.asarray(cv2.subtract(mean, side), np.uint16)
+    mean, left, right = _with_sides(values, shape)
+    return np.asarray(cv2.subtract(mean, cv2.max(left, right)), np.uint16)
+
+
+def _with_sides(values: U16, shape: _Filter) -> tuple[U16, U16, U16]:
+    """Means over the line's width around each place, and to the left and right of it."""
+    mean = np.asarray(cv2.blur(values, (shape.centre, 1), borderType=cv2.BORDER_REPLICATE), np.uint16)
+    padded = np.asarray(cv2.copyMakeBorder(mean, 0, 0, shape.away, shape.away, cv2.BORDER_REPLICATE), np.uint16)
+    return mean, padded[:, : -2 * shape.away], padded[:, 2 * shape.away :]

@@ -31,6 +31,10 @@ _BLEEDS, _WHITISH = (0.4, 0.05), 0.8
 # By how much the laser's channel leads beside a saturated core, as a share of all light there and of the core's own:
 # white by the less, coloured by the more.
 _NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
+# From which share of its rows on a run's core is saturated. What then lags behind the laser's channel by the second
+# [grey levels], not cut, is not white; nor is, of other runs, what has less than the third in other channels.
+_CLIPPED, _COLOURED, _SURELY = 0.3, 10.0, 0.9
+_BRIGHT = 170.0  # [grey levels] beside a core
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
@@ -142,8 +146,8 @@ def _of_laser(seen: _Colours, laser: float | None, noise: float) -> F32:
     return np.asarray(np.where(seen.saturated, np.maximum(factor, pure), factor), np.float32)
 
 
-def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, rows: int) -> Mask:
-    """Rows (P H,) in runs that stand out in another channel nearly as much as in the laser's own.
+def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, rows: int) -> tuple[Mask, Mask]:
+    """Rows (P H,) in runs that stand out in another channel nearly as much as in the laser's own; and those sure to.
 
     Args:
         column: (P H,) of the lines of P pictures below each other, NaN where none.
@@ -153,24 +157,27 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, 
         rows: of a picture, H.
 
     Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
-    parts are asked. Where the core saturates they say nothing, but what is beside it must not be white.
+    parts are asked. Where the core saturates they say nothing, but what is beside it must not be white; where that is
+    bright itself, as a white board is, it hardly can be anything else, and the core must not be white.
     """
     lost = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
     if not row.size or image.shape[1] <= 2 * HALF:
-        return lost
+        return lost, lost
     run = numbered(row, column[row], 1, rows)
     doubtful = (np.bincount(run, pure[row]) < _MOSTLY * np.bincount(run))[run]
     if not doubtful.any():
-        return lost
+        return lost, lost
     row, run = row[doubtful], run[doubtful]
     middle = np.rint(column[row]).astype(np.intp)
     y = across(image, row, middle)
     height = light_added(y.astype(np.float32), channel)
     clipped = y[HALF, channel] >= COLOURLESS
+    count = np.bincount(run)
     by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
-    lost[row] = _white_beside(image, row, middle, channel, clipped, run)
-    stranger = _in_other_channels(by_run, np.bincount(run), channel)[run]
+    coloured, bright = _core_of(y, channel, run)
+    lost[row] = _white_beside(image, row, middle, channel, clipped, run) & ~(coloured & bright)[run]
+    stranger = _in_other_channels(by_run, count, channel)[run]
     if stranger.any():
         # Sums over the rows nearby as differences of sums from the start.
         total = np.zeros((4, len(row) + 1))
@@ -180,7 +187,24 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, 
         stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
         stranger &= _in_other_channels(total[:, stop] - total[:, first], stop - first, channel)
         lost[row[stranger]] = True
-    return lost
+    sure, share = lost.copy(), np.maximum(by_run[channel - 1], by_run[channel - 2]) / np.maximum(by_run[channel], 1.0)
+    sure[row[np.where(by_run[3] > _CLIPPED * count, coloured, share < _SURELY)[run]]] = False
+    return lost, sure
+
+
+def _core_of(y: NDArray[np.int16], channel: int, run: Index) -> tuple[Mask, Mask]:
+    """Runs (n,) whose cores are not white though they saturate, and runs on something bright.
+
+    Args:
+        y: (2 HALF + 1, 3, N) samples across the rows of the runs (N,).
+    """
+    core, side = (
+        np.array([np.bincount(run, values) for values in part]) / np.maximum(np.bincount(run), 1)
+        for part in (y[HALF], 0.5 * np.maximum(y[0] + y[1], y[-1] + y[-2]))
+    )
+    others = core[[channel - 1, channel - 2]]
+    coloured = (others < COLOURLESS) & (core[channel] - others > _COLOURED)
+    return coloured.any(axis=0), side[channel] > _BRIGHT
 
 
 def _between(values: F32, low: float, high: float) -> F32:
@@ -192,7 +216,7 @@ def _between(values: F32, low: float, high: float) -> F32:
 def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: Mask, run: Index) -> Mask:
     """Rows (N,) of runs whose core saturates with white beside it: a gap in a blind, a tube of light."""
     white = np.zeros(len(row), bool)
-    many = np.bincount(run, clipped) > 0.3 * np.bincount(run)
+    many = np.bincount(run, clipped) > _CLIPPED * np.bincount(run)
     at = np.flatnonzero(many[run] & clipped)
     if at.size:
         leads = flank_lead(across(image, row[at], middle[at]).astype(np.float32), channel, purer_side=True)
@@ -206,7 +230,7 @@ def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: M
 def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) -> Mask:
     """Whether parts stand out in another channel; `total` (4, N): heights by channel, clipped rows; of `rows` (N,)."""
     other = np.maximum(total[:3][channel - 1], total[:3][channel - 2])
-    in_other: Mask = (other > _STRANGER * total[channel]) & (total[3] < 0.3 * rows)
+    in_other: Mask = (other > _STRANGER * total[channel]) & (total[3] < _CLIPPED * rows)
     return in_other
 
 

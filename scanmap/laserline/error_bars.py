@@ -26,6 +26,15 @@ class Doubts(NamedTuple):
     edges: Edges  # (N,) of the room's brightness
     plain: NDArray[np.bool_]  # (N,) whether nothing else but noise is known to move the line
 
+    @property
+    def each(self) -> tuple[NDArray[np.generic], ...]:
+        """All of them, arrays (N,)."""
+        return *self.edges, self.plain
+
+    def of(self, some: slice) -> Doubts:
+        """Of some of the rows."""
+        return Doubts(Edges(self.edges.shift[some], self.edges.doubt[some]), self.plain[some])
+
 
 def no_doubts(rows: int) -> Doubts:
     """Of so many rows, nothing yet."""

@@ -21,9 +21,10 @@ from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
 from scanmap.laserline.offframe import standing_out
 from scanmap.laserline.offmatch import in_place
+from scanmap.laserline.onward import goes_on
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
-from scanmap.laserline.peaks import SPECKLE_FROM, Peaks, fit_gaussian
+from scanmap.laserline.peaks import SPECKLE_FROM, fit_gaussian, judged
 from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
 from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
@@ -34,6 +35,7 @@ Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 # [px] what the search needs to see beside the window at quarter resolution.
 _MARGIN = 64
@@ -49,6 +51,8 @@ _BLOCKS_ROWS = 18
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Share of its rows in which a picture must show the line to be thought of the laser's colour.
 _MOSTLY = 0.5
+# Rounds in which the line is followed, and how far from there a row may show it.
+_ROUNDS, _ON_TRACK_PX = 3, 2.0
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
 
@@ -169,7 +173,7 @@ def _look(
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
     sight = sight_of(image, background, how, height, channel, roundings)
     course = search(sight, window - left, params.min_snr, still)
-    lines = _found(sight, course, params, windows - left)
+    lines = _found(sight, course, params, windows - left, still)
     lines.column_px[:] += left
     # What does not change with the laser is gone already where there is a laser-off frame.
     places = [p + np.float32(left) if background is None else None for p in course.places]
@@ -183,7 +187,7 @@ def _each(lines: LaserLine, height: int) -> list[LaserLine]:
     return [LaserLine(column[k], peak[k], width[k], sigma[k], reason[k]) for k in own]
 
 
-def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array) -> LaserLine:
+def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array, still: Mask | None) -> LaserLine:
     noise, height = sight.noise, sight.height
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
     line, doubts = _located(sight, (row, column), params)
@@ -199,10 +203,13 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array)
         take_cores(line, at, y.T, widest, around.rows, params)
     if sight.image is not None:
         pure = np.repeat(course.pure, BLOCK, axis=1)[:, :height].ravel()
-        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure, height), Reason.AMBIGUOUS)
+        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure, height)[0], Reason.AMBIGUOUS)
     if sight.off is None and params.method == "gauss":
         line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane, height), Reason.WIDE)
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px, height), Reason.EDGE)
+    for k, (picture, one) in enumerate(zip(sight.pictures(), _each(line, height), strict=True)):
+        own = slice(k * height, (k + 1) * height)
+        _go_on(one, doubts.of(own), picture, params, window[own], still)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
@@ -234,7 +241,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         sides = sides_of(y, rows)
         peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some))
         contrasts = peaks.contrast
-        reason = _judged(peaks, noise, params)
+        reason = judged(peaks, noise, params)
         peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some)
         if sight.off is None:
             own = across_edges(peaks, reason == Reason.OK, sides, around, half, some)
@@ -268,19 +275,27 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
     return line, doubts
 
 
-def _judged(peaks: Peaks, noise: F32, params: LaserLineParams) -> NDArray[np.uint8]:
-    """Reason (N,) of each fit."""
-    reason = np.full(len(peaks.height), Reason.OK, np.uint8)
-    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / np.maximum(noise, 1.0)
-    reason[peaks.one_sided] = Reason.EDGE
-    reason[np.abs(peaks.offset_px) > 3.0 + 0.7 * peaks.width_px] = Reason.AMBIGUOUS
-    reason[peaks.sigma_px > 1.5] = Reason.WEAK
-    # A dim bump whose samples scatter far more than the sensor's do is texture of the room.
-    reason[(peaks.noise > 2.5 * np.maximum(noise, 1.5)) & (peaks.height < 3.5 * peaks.noise)] = Reason.AMBIGUOUS
-    reason[(snr < params.min_snr) | (peaks.height < params.min_peak)] = Reason.WEAK
-    reason[peaks.width_px > params.max_width_px] = Reason.WIDE
-    reason[peaks.width_px < 0.33] = Reason.NARROW
-    return reason
+def _go_on(
+    line: LaserLine, doubts: Doubts, sight: Sight, params: LaserLineParams, window: Array, still: Mask | None
+) -> None:
+    """Rows into which a run of a picture's line goes on, in place: what a row leaves open its neighbours tell."""
+    free = np.isfinite(window[:, 0]) & (line.reason != Reason.EDGE)
+    for _ in range(_ROUNDS):
+        row, column = goes_on(line, sight.lit, float(sight.noise[0]), free, still)
+        if not row.size:
+            return
+        more, other = _located(sight, (row, column), params)
+        on_track = np.zeros(len(free), bool)
+        on_track[row] = np.abs(more.column_px[row] - column) < _ON_TRACK_PX
+        on_track &= (more.width_px < runs.NO_BLOB_PX + np.nanmedian(line.width_px)) & free
+        more = without(_within(more, window), ~on_track, Reason.WEAK)
+        if sight.image is not None:
+            none = np.zeros(len(free), bool)
+            more = without(more, strangers(more.column_px, sight.image, sight.channel, none, len(free))[1], Reason.WEAK)
+        found = np.isfinite(more.column_px)
+        for values, new in zip((*line[:4], *doubts.each), (*more[:4], *other.each), strict=True):
+            values[found] = new[found]
+        line.reason[found] = Reason.OK
 
 
 def _within(line: LaserLine, window: Array) -> LaserLine:

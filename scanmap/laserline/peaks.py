@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.dim import DimRows, dim_rows
 from scanmap.laserline.noise import dot, noise_variance, speckle_contrasts
+from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.pictures import Rows, not_one
+from scanmap.laserline.result import Reason
 from scanmap.laserline.samples import levelled
 from scanmap.laserline.steps import (
     ITERATIONS,
@@ -187,3 +189,18 @@ def _fit_speckle(y: F32, x: F32, usable: F32, fit: Fit, rows: Rows, contrasts: F
         weight = usable * near(x, model, _SPECKLE_REACH) * (floor / variance)
         model = improve(y, x, weight, model)
     return model, weight
+
+
+def judged(peaks: Peaks, noise: F32, params: LaserLineParams) -> NDArray[np.uint8]:
+    """Reason (N,) of each fit."""
+    reason = np.full(len(peaks.height), Reason.OK, np.uint8)
+    snr = peaks.height * np.sqrt(1.77 * peaks.width_px) / np.maximum(noise, 1.0)
+    reason[peaks.one_sided] = Reason.EDGE
+    reason[np.abs(peaks.offset_px) > 3.0 + 0.7 * peaks.width_px] = Reason.AMBIGUOUS
+    reason[peaks.sigma_px > 1.5] = Reason.WEAK
+    # A dim bump whose samples scatter far more than the sensor's do is texture of the room.
+    reason[(peaks.noise > 2.5 * np.maximum(noise, 1.5)) & (peaks.height < 3.5 * peaks.noise)] = Reason.AMBIGUOUS
+    reason[(snr < params.min_snr) | (peaks.height < params.min_peak)] = Reason.WEAK
+    reason[peaks.width_px > params.max_width_px] = Reason.WIDE
+    reason[peaks.width_px < 0.33] = Reason.NARROW
+    return reason

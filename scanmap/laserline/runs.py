@@ -19,7 +19,7 @@ _CERTAIN, _BRIGHT, _POSSIBLE = 0.06, 40.0, 0.15
 _UNEVEN_PX, _UNEVEN_HEIGHT = 3.0, 14.0
 _INNER = 8  # rows of a run long enough to have ends and an inside
 _NEAR_ROWS = 6  # between the rows found above and below one that is too dim alone
-_GAP_ROWS = 2  # missing rows that do not end a run
+GAP_ROWS = 2  # missing rows that do not end a run
 
 
 def continuing(row: Index, column: F32, sigma: F32, good: Mask, dim: Mask, height: int) -> Index:
@@ -157,7 +157,7 @@ def crumbs(column: Array, weak: Mask, rows: int, least: int = 12) -> Mask:
     found = np.isfinite(column).nonzero()[0]
     if not found.size:
         return mask
-    number = numbered(found, column[found], _GAP_ROWS + 1, rows)
+    number = numbered(found, column[found], GAP_ROWS + 1, rows)
     length = np.bincount(number)
     doubtful = np.bincount(number, weak[found]) > 0.5 * length
     mask[found[((length < 4) | (doubtful & (length < least)))[number]]] = True
