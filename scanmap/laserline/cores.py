@@ -1,4 +1,4 @@
-"""Where a line is no Gaussian: the middle of its bright core, or its centre of gravity."""
+"""Where a line is no Gaussian: its brightest pixel, the middle of its bright core, or its centre of gravity."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.pictures import Rows
 from scanmap.laserline.pooling import APART_ROWS, TELLING, segments, unexplained
-from scanmap.laserline.result import LaserLine, Reason
+from scanmap.laserline.result import LaserLine, Reason, without
 
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -57,6 +58,17 @@ def bright_core(y: F32) -> Cores:
     width = np.sqrt(np.maximum(np.einsum("ij,j->i", w, x * x) / total - offset**2, 0.0) + 1.0 / 12.0)
     sigma = np.maximum(0.12, 0.3 * width)
     return Cores(offset.astype(np.float32), sigma.astype(np.float32), width.astype(np.float32), top - side)
+
+
+def brightest(plane: U8, min_peak: float) -> LaserLine:
+    """T5 of the thesis: value and column of the first maximum of each row of a plane (H, W), whatever it is."""
+    column = plane.argmax(axis=1)
+    value = plane[np.arange(len(plane)), column].astype(np.float64)
+    reason = np.where(value < min_peak, Reason.WEAK, Reason.OK).astype(np.uint8)
+    # A column between two pixel borders: the standard deviation of a uniform distribution.
+    sigma = np.full(len(plane), np.sqrt(1.0 / 12.0))
+    line = LaserLine(column.astype(np.float64), value, np.full(len(plane), np.nan), sigma, reason)
+    return without(line, reason == Reason.WEAK, Reason.WEAK)
 
 
 def centre_of_gravity(y: F32, height_share: float = 0.2) -> F32:

@@ -14,7 +14,7 @@ from scanmap.laserline.brightness import by_brightness
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import strangers
-from scanmap.laserline.cores import centre_of_gravity, take_cores
+from scanmap.laserline.cores import brightest, centre_of_gravity, take_cores
 from scanmap.laserline.edges import across_edges, doubt_of_edges, sides_of
 from scanmap.laserline.error_bars import Doubts, no_doubts, with_error_bars
 from scanmap.laserline.flat import flat_tops
@@ -161,8 +161,8 @@ def _look(
         window = np.tile([0.0, width - 1.0], (height, 1))
     windows = np.tile(window, (pictures, 1))
     if params.method == "brightest":
-        lines = _brightest(to_grey(image, params.grey, params.bit_index, max(channel or 0, 0)), params, windows)
-        return [Look(line) for line in _each(lines, height)]
+        plane = to_grey(image, params.grey, params.bit_index, max(channel or 0, 0))
+        return [Look(line) for line in _each(_within(brightest(plane, params.min_peak), windows), height)]
     if not np.isfinite(window).any():
         return [Look(no_line(height, Reason.WINDOW)) for _ in images]
     # Everything below sees only the columns in question; in fours, which are summed in pairs and those again.
@@ -293,6 +293,8 @@ def _go_on(
             none = np.zeros(len(free), bool)
             more = without(more, strangers(more.column_px, sight.image, sight.channel, none, len(free))[1], Reason.WEAK)
         found = np.isfinite(more.column_px)
+        if not found.any():
+            return
         for values, new in zip((*line[:4], *doubts.each), (*more[:4], *other.each), strict=True):
             values[found] = new[found]
         line.reason[found] = Reason.OK
@@ -305,15 +307,3 @@ def _within(line: LaserLine, window: Array) -> LaserLine:
         outside = np.isfinite(column) & ~((column >= window[:, 0]) & (column <= window[:, 1]))
     line.reason[np.isnan(window[:, 0])] = Reason.WINDOW
     return without(line, outside, Reason.WINDOW)
-
-
-def _brightest(plane: U8, params: LaserLineParams, window: Array) -> LaserLine:
-    """T5 of the thesis: value and column of the first maximum of each row, whatever it is."""
-    column = plane.argmax(axis=1)
-    value = plane[np.arange(len(plane)), column].astype(np.float64)
-    reason = np.where(value < params.min_peak, Reason.WEAK, Reason.OK).astype(np.uint8)
-    # A column between two pixel borders: the standard deviation of a uniform distribution.
-    sigma = np.full(len(plane), np.sqrt(1.0 / 12.0))
-    line = LaserLine(column.astype(np.float64), value, np.full(len(plane), np.nan), sigma, reason)
-    line = without(line, reason == Reason.WEAK, Reason.WEAK)
-    return _within(line, window)
