@@ -24,7 +24,7 @@ import numpy as np
 from scanmap.calibration import Calibration
 from scanmap.config import load
 from scanmap.grid import OccupancyGrid
-from scanmap.laserline import clear_channel, look_at_all
+from scanmap.laserline import laser_of, look_at_all
 from scanmap.pipeline import TOGETHER, Pipeline, Processes, SecondLook, checked
 from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
@@ -125,15 +125,15 @@ def main() -> None:
         ),
     }
     images = np.stack([decode_image(jpeg, grey=grey).image for jpeg in jpegs[:TOGETHER]])
-    channel = None if grey else clear_channel(images[0], config.laserline)
-    lines = [look.line for look in look_at_all(images, config.laserline, pipeline.window, channel)]
+    laser = None if grey else laser_of(images[0], config.laserline)
+    lines = [look.line for look in look_at_all(images, config.laserline, pipeline.window, laser)]
     parts: dict[str, Callable[[int], object]] = {
         f"{name} to {planes}": lambda k, decode=decode: decode(jpegs[k % DISTINCT]) for name, decode in decoders.items()
     }
     parts["triangulation"] = lambda k: triangulate(lines[k % TOGETHER], head, config.triangulation)
     for together in (1, TOGETHER):
         parts[f"laser line, {together} at once"] = lambda k, some=images[:together]: [
-            look_at_all(some, config.laserline, pipeline.window, channel) for _ in range(TOGETHER // len(some))
+            look_at_all(some, config.laserline, pipeline.window, laser) for _ in range(TOGETHER // len(some))
         ]
     for name, action in parts.items():
         frames_each = TOGETHER if name.startswith("laser") else 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic_lines import GREEN, line_light, sensor
 
-from scanmap.laserline import LaserLineParams, find_laser_line, look, look_at_all
+from scanmap.laserline import Laser, LaserLineParams, find_laser_line, look, look_at_all
 from scanmap.laserline.onward import goes_on
 
 GAUSS = LaserLineParams()
@@ -76,6 +76,7 @@ def test_only_free_rows_ahead_of_long_straight_runs_are_asked():
 def test_a_line_is_followed_in_several_pictures_as_in_each_alone():
     images = [picture(below, 120.0, LEAKY, 40.0, seed) for seed, (below, _) in enumerate([*UNTOLD, *UNTOLD])]
     images.append(sensor(np.full((ROWS, WIDTH, 3), 40.0, np.float32), 1.5, np.random.default_rng(9)))
-    for one, image in zip(look_at_all(np.stack(images), GAUSS, None, 1), images, strict=True):
-        for together, alone in zip(one.line, look(image, GAUSS, channel=1).line, strict=True):
+    green = Laser(1, (1.5, 1.5, 2.1))
+    for one, image in zip(look_at_all(np.stack(images), GAUSS, None, green), images, strict=True):
+        for together, alone in zip(one.line, look(image, GAUSS, laser=green).line, strict=True):
             np.testing.assert_array_equal(together, alone)

@@ -196,7 +196,7 @@ def test_shots_together_give_what_each_gives_alone(head: Calibration) -> None:
     source = [Shot(k, 0.01 * k, 0.01 * k, 0.1 * k, image) for k, image in enumerate(pictures)]
     pipeline, unasked = (Pipeline(head, LaserLineParams(), TriangulationParams()) for _ in range(2))
     assert list(checked(source, pipeline)) == source
-    assert pipeline.channel == 2
+    assert pipeline.laser is not None and pipeline.laser.channel == 2
     for ask in (pipeline, unasked):
         for together, shot in zip(ask.process_all(source), source, strict=True):
             alone = ask.process(shot)
@@ -213,7 +213,7 @@ def test_shots_together_give_what_each_gives_alone(head: Calibration) -> None:
 def test_a_picture_that_leaves_doubt_tells_no_channel(head: Calibration) -> None:
     pipeline = Pipeline(head, LaserLineParams(), TriangulationParams())
     assert len(list(checked(shots(5), pipeline))) == 5
-    assert pipeline.channel is None
+    assert pipeline.laser is None
 
 
 def test_what_a_worker_process_raises_is_raised_here(head: Calibration) -> None:
@@ -249,7 +249,8 @@ def test_source_that_fails_and_stop_end_the_worker_processes_run_too(processes: 
         processes.run(breaking(), [steps.append])
     assert [step.shot.index for step in steps] == list(range(5))
     assert processes.run(shots(60), [], stop=lambda: True) == 1
-    assert processes.run(shots(60), [steps.append], stop=lambda: len(steps) >= 8) < 45
+    # What was read ahead of the sinks is still finished.
+    assert processes.run(shots(300), [steps.append], stop=lambda: len(steps) >= 8) < 200
 
 
 def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:

@@ -2,22 +2,24 @@
 
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.grey import binary_image, overlay, to_grey
-from scanmap.laserline.line import clear_channel, find_laser_line, look, look_at_all
+from scanmap.laserline.line import find_laser_line, laser_of, look, look_at_all
 from scanmap.laserline.params import LaserLineParams, needs_colour
 from scanmap.laserline.result import LaserLine, Look, Reason
 from scanmap.laserline.ridges import ridge_of, ridges
 from scanmap.laserline.rounding import Rounding, rounding_of
+from scanmap.laserline.sight import Laser
 
 __all__ = [
     "BLOCK",
+    "Laser",
     "LaserLine",
     "LaserLineParams",
     "Look",
     "Reason",
     "Rounding",
     "binary_image",
-    "clear_channel",
     "find_laser_line",
+    "laser_of",
     "look",
     "look_at_all",
     "needs_colour",

@@ -29,7 +29,7 @@ from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
 from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import Course, search
-from scanmap.laserline.sight import Conversion, Sight, channel_of, sight_of
+from scanmap.laserline.sight import Conversion, Laser, Sight, channel_of, noises_in_band, sight_of
 
 Array = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -85,7 +85,7 @@ def look(
     background: U8 | None = None,
     window: Array | None = None,
     still: NDArray[np.bool_] | None = None,
-    channel: int | None = None,
+    laser: Laser | None = None,
     rounding: Rounding | None = None,
 ) -> Look:
     """Locate the laser line as `find_laser_line` does, and all else that looks like one.
@@ -93,17 +93,15 @@ def look(
     Args:
         still: (ceil(H / BLOCK), W) where things of the room are known to be, in blocks of rows; the line is looked
             for everywhere else.
-        channel: the laser's, where other pictures of the scan have told it (see `clear_channel`) and `params` leave
-            it open; a picture in which most rows have no line in it is asked for its own.
+        laser: what another picture of the scan has told of it (see `laser_of`), where `params` leave its channel open;
+            a picture in which most rows have no line in that channel is asked for its own.
         rounding: of the file that the picture was, as `rounding_of` reads it.
     """
     if background is not None:
         background = in_place(image, background)
-    if params.grey != "auto" or image.ndim == 2:
-        channel = None
-    if channel is not None:
-        told = _look(image[None], params, background, window, still, channel, [rounding])[0]
-        if _mostly_found(told) or (own := channel_of(image, background, params.grey)) == channel:
+    if laser is not None and params.grey == "auto" and image.ndim == 3:
+        told = _look(image[None], params, background, window, still, laser, [rounding])[0]
+        if _mostly_found(told) or (own := channel_of(image, background, params.grey)) == laser.channel:
             return told
         return _look(image[None], params, background, window, still, own, [rounding])[0]
     channel = channel_of(image, background, params.grey)
@@ -114,29 +112,30 @@ def look_at_all(
     images: U8,
     params: LaserLineParams,
     window: Array | None = None,
-    channel: int | None = None,
+    laser: Laser | None = None,
     roundings: Sequence[Rounding | None] | None = None,
 ) -> list[Look]:
     """What `look` gives for each of the pictures (P, H, W) or (P, H, W, 3) of one scan, bit for bit, sooner."""
-    told = channel is not None and params.grey == "auto" and images.ndim == 4
-    channels = [channel if told else channel_of(image, None, params.grey) for image in images]
     roundings = [None] * len(images) if roundings is None else roundings
+    if laser is not None and params.grey == "auto" and images.ndim == 4:
+        looks = _look(images, params, None, window, None, laser, roundings)
+        for k, image in enumerate(images):
+            if not _mostly_found(looks[k]):
+                looks[k] = look(image, params, None, window, None, laser, roundings[k])
+        return looks
+    channels = [channel_of(image, None, params.grey) for image in images]
     if len(set(channels)) > 1:
         each = zip(images, roundings, strict=True)
-        return [look(image, params, None, window, None, channel, rounding) for image, rounding in each]
-    looks = _look(images, params, None, window, None, channels[0], roundings)
-    for k, image in enumerate(images if told else ()):
-        if not _mostly_found(looks[k]):
-            looks[k] = look(image, params, None, window, None, channel, roundings[k])
-    return looks
+        return [look(image, params, None, window, rounding=rounding) for image, rounding in each]
+    return _look(images, params, None, window, None, channels[0], roundings)
 
 
-def clear_channel(image: U8, params: LaserLineParams, background: U8 | None = None) -> int | None:
-    """The laser's channel in a picture, where `params` leave it open and the picture leaves no doubt; else None."""
+def laser_of(image: U8, params: LaserLineParams, background: U8 | None = None) -> Laser | None:
+    """What a picture tells of the laser, where `params` leave its channel open and it leaves no doubt; else None."""
     if params.grey != "auto" or image.ndim == 2:
         return None
     channel, clear = judged_channel(image, background)
-    return channel if clear else None
+    return Laser(channel, noises_in_band(image, channel)) if clear else None
 
 
 def _mostly_found(look: Look) -> bool:
@@ -150,10 +149,11 @@ def _look(
     background: U8 | None,
     window: Array | None,
     still: NDArray[np.bool_] | None,
-    channel: int | None,
+    laser: Laser | int | None,
     roundings: Sequence[Rounding | None],
 ) -> list[Look]:
-    """Look at pictures (P, H, W, ...) whose line is looked for in one channel."""
+    """Look at pictures (P, H, W, ...) whose line is looked for in one channel, which may be all that is known of it."""
+    channel, noises = laser if isinstance(laser, Laser) else (laser, None)
     pictures, height, width = images.shape[:3]
     # From here on, one below the other.
     image = np.ascontiguousarray(images).reshape(pictures * height, *images.shape[2:])
@@ -171,7 +171,7 @@ def _look(
     background = None if background is None else background[:, left : left + image.shape[1]]
     still = None if still is None else still[:, left : left + image.shape[1]]
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
-    sight = sight_of(image, background, how, height, channel, roundings)
+    sight = sight_of(image, background, how, height, channel, roundings, noises)
     course = search(sight, window - left, params.min_snr, still)
     lines = _found(sight, course, params, windows - left, still)
     lines.column_px[:] += left

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.grey import extract, to_grey
 from scanmap.laserline.params import LaserLineParams
-from scanmap.laserline.sight import ONE_FOR_ALL, channel_of
+from scanmap.laserline.sight import ONE_FOR_ALL, Laser, channel_of
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -20,16 +20,15 @@ _SHARE = 0.8  # of its height that a line has in the best of these, unless it is
 _CUT = 140.0  # [grey levels] what a bright line has more than this is often cut at white in another picture
 
 
-def ridges(image: U8, params: LaserLineParams, channel: int | None = None) -> U8:
+def ridges(image: U8, params: LaserLineParams, laser: Laser | None = None) -> U8:
     """How far each place of a picture (H, W) or (H, W, 3) rises over both its sides (ceil(H / BLOCK), W) [grey levels].
 
     In the plane that the line is looked for in, in means over BLOCK rows, and at the best of three widths.
 
     Args:
-        channel: the laser's, where other pictures of the scan have told it.
+        laser: what another picture of the scan has told of it.
     """
-    if channel is None or image.ndim == 2:
-        channel = channel_of(image, None, params.grey)
+    channel = channel_of(image, None, params.grey) if laser is None or image.ndim == 2 else laser.channel
     own = channel == ONE_FOR_ALL
     plane = extract(image, 1) if own else to_grey(image, params.grey, params.bit_index, channel)
     height, width = plane.shape

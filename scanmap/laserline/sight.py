@@ -19,6 +19,9 @@ from scanmap.laserline.rounding import Mixture, Rounding, best_mixture
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 
+# Of a channel, of its neighbour and of their difference [grey levels], at the frequencies of a line.
+Noises = tuple[float, float, float]
+
 ONE_FOR_ALL = -1  # the channel of a colour picture without colour
 
 # Noise of the difference of two channels over that of one, from which on they are independent; below, in grey levels,
@@ -30,6 +33,13 @@ _BAND_PX = 3  # columns in a group that is compared with the next
 # How far the mixture goes from there to the laser's own channel where the file does not say what was rounded, at the
 # least, and for each grey level of noise: more averages noise, less the errors that all rows of an upright line share.
 _COLOUR, _COLOUR_PER_NOISE = 0.1, 0.3
+
+
+class Laser(NamedTuple):
+    """What a picture tells of the laser in all pictures of a scan."""
+
+    channel: int  # it shows in
+    noise: Noises  # that its line is seen in
 
 
 class Conversion(NamedTuple):
@@ -87,6 +97,7 @@ def sight_of(
     height: int,
     channel: int | None,
     roundings: Sequence[Rounding | None],
+    noises: Noises | None = None,
 ) -> Sight:
     """Look at pictures.
 
@@ -96,6 +107,7 @@ def sight_of(
         how: colour becomes one plane.
         channel: as `channel_of` has it.
         roundings: (P,) of the files that the pictures were.
+        noises: in that channel, where another picture has told them.
     """
     if channel == ONE_FOR_ALL:
         channel, image, background = None, image[..., 1], None if background is None else background[..., 1]
@@ -107,7 +119,7 @@ def sight_of(
         plane = image[..., channel] if large else extract(image, channel)
         noise = _noises(plane, rows, height)
         each = zip(range(0, len(image), height), noise, roundings, strict=True)
-        mixtures = [_mixture(image[k : k + height], channel, own, rounding) for k, own, rounding in each]
+        mixtures = [_mixture(image[k : k + height], channel, own, rounding, noises) for k, own, rounding in each]
         return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
     off, gain = None, 1.0
@@ -154,7 +166,7 @@ def _noise_of(plane: U8) -> float:
     return float(noises_of(plane[None])[0])
 
 
-def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -> Mixture:
+def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None, noises: Noises | None) -> Mixture:
     """What of a picture's channels the line is placed in.
 
     Cameras and JPEG store colour at half the columns and coarser steps: a channel is brightness, which is sharp, and
@@ -163,7 +175,7 @@ def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -
     stored at fewer columns and coarser steps differs by less the coarser it is.
     """
     if rounding is not None and rounding.colour is not None:
-        return best_mixture(rounding, channel, _noise_in_band(image, channel))
+        return best_mixture(rounding, channel, noises or noises_in_band(image, channel))
     rows = np.ascontiguousarray(image[:: max(1, len(image) // 8), ::2])
     own, other = (np.asarray(cv2.extractChannel(rows, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
     difference = _noise_of(np.asarray(cv2.addWeighted(own, 1.0, other, -1.0, 128.0), np.uint8))
@@ -174,7 +186,7 @@ def _mixture(image: U8, channel: int, noise: float, rounding: Rounding | None) -
     return Mixture(channel, BRIGHTNESS[channel] + colour * (1.0 - BRIGHTNESS[channel]))
 
 
-def _noise_in_band(image: U8, channel: int) -> tuple[float, float, float]:
+def noises_in_band(image: U8, channel: int) -> Noises:
     """Noise of a channel, its neighbour and their difference, at the frequencies of a line, as a sample's would be.
 
     Compression takes the noise between one column and the next, which moves no line, and leaves more of that between

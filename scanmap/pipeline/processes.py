@@ -24,7 +24,7 @@ from typing import IO, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline import LaserLine
+from scanmap.laserline import Laser, LaserLine
 from scanmap.pipeline.running import run_groups
 from scanmap.pipeline.step import Pipeline, Sink, Step
 from scanmap.shot import Shot
@@ -35,9 +35,9 @@ log = logging.getLogger(__name__)
 # Below so many shots a worker costs more to start (half a second) than it brings.
 WORTH_SHOTS = 100
 # Shots sent in one message, and looked at together: waking this process for each interrupted a worker ten times a
-# frame, and the line in four pictures at once costs two thirds of what it costs one by one. Of more pictures, what one
-# step leaves for the next is no longer in the processor's cache.
-TOGETHER = 4
+# frame, and the line in twelve pictures at once costs three fifths of what it costs one by one. Of more pictures, what
+# one step leaves for the next is no longer in the processor's cache.
+TOGETHER = 12
 # Messages on their way to one worker: it finds the next images waiting when it is done with some.
 IN_FLIGHT = 2
 # Reading shots and handing them to so many cores leaves this process time to work on some: it need not be started,
@@ -129,7 +129,7 @@ class Processes:
         """The steps of shots that whichever worker is free has processed; or what it raised, in the place of one."""
         worker = self._free.get()
         try:
-            answers = worker.ask(shots, self.pipeline.channel) if worker else _answers(self.pipeline, shots)
+            answers = worker.ask(shots, self.pipeline.laser) if worker else _answers(self.pipeline, shots)
         except (OSError, EOFError, pickle.UnpicklingError, ValueError) as gone:
             log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
             return iter([self.pipeline.process(shot) for shot in shots])
@@ -169,13 +169,13 @@ class _Worker:
             pickle.dump(first, self._to, protocol=5)
         self._to.flush()
 
-    def ask(self, shots: list[Shot], channel: int | None) -> list[Answer]:
-        """Send shots and the laser's channel; the answers, which come in the order of messages, whoever asks."""
+    def ask(self, shots: list[Shot], laser: Laser | None) -> list[Answer]:
+        """Send shots and what is known of the laser; the answers, which come in the order of messages, whoever asks."""
         with self._sending:
             before, read = self._last_read, threading.Event()
             self._last_read = read
             try:
-                pickle.dump((channel, shots), self._to, protocol=5)
+                pickle.dump((laser, shots), self._to, protocol=5)
                 self._to.flush()
             except BaseException:
                 read.set()
@@ -222,7 +222,7 @@ def serve(messages: IO[bytes], answers: IO[bytes]) -> None:
     gc.freeze()  # what was imported is never garbage
     while True:
         try:
-            pipeline.channel, shots = cast(tuple[int | None, list[Shot]], pickle.load(messages))
+            pipeline.laser, shots = cast(tuple[Laser | None, list[Shot]], pickle.load(messages))
         except EOFError:
             return
         pickle.dump(_answers(pipeline, shots), answers, protocol=5)

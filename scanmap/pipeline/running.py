@@ -16,6 +16,7 @@ from scanmap.errors import CameraError
 from scanmap.pipeline.step import Pipeline, Sink, Step
 from scanmap.shot import Shot, decode_image
 
+_AHEAD = 3  # groups of shots that are read before the first is begun, where more than one make a group
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
 
 
@@ -26,9 +27,9 @@ class Runner(Protocol):
 
 
 def checked(shots: Iterable[Shot], pipeline: Pipeline) -> Iterator[Shot]:
-    """The same shots, after the first readable images were held against the calibration and told the laser's channel.
+    """The same shots, after the first readable images were held against the calibration and told of the laser.
 
-    One that fits is enough: a single odd image costs its own shot, not the scan. So is one that shows the channel.
+    One that fits is enough: a single odd image costs its own shot, not the scan. So is one that shows the laser.
 
     Raises:
         CalibrationError: the images have another size than the calibration; before anything is processed.
@@ -45,7 +46,7 @@ def checked(shots: Iterable[Shot], pipeline: Pipeline) -> Iterator[Shot]:
             continue
         fits = (width, height) == (calibration.intrinsics.width, calibration.intrinsics.height)
         odd, fitting = [*odd, *[(width, height)] * (not fits)], fitting + fits
-        if (fits and pipeline.ask_channel(shot)) or CHECKED_IMAGES in (len(odd), fitting):
+        if (fits and pipeline.ask_laser(shot)) or CHECKED_IMAGES in (len(odd), fitting):
             break
     if odd and not fitting:
         calibration.check_image(*odd[0])
@@ -82,12 +83,19 @@ def run_groups(
     workers: int,
     together: int,
 ) -> int:
-    """`run` with `together` shots handed to a thread at once; what `process` gives is iterated in the caller's."""
+    """`run` with `together` shots handed to a thread at once; what `process` gives is iterated in the caller's.
+
+    The last groups are ever smaller, so that no core waits long for what another has begun.
+    """
     workers = workers or os.cpu_count() or 1
     sinks = tuple(sinks)
     pending: deque[Future[Iterable[Step]]] = deque()
-    group: list[Shot] = []
+    ahead: deque[Shot] = deque()
+    most_ahead = _AHEAD * together if together > 1 else 1
     done = 0
+
+    def begin(count: int) -> None:
+        pending.append(pool.submit(process, [ahead.popleft() for _ in range(count)]))
 
     def deliver() -> None:
         nonlocal done
@@ -99,17 +107,16 @@ def run_groups(
     with _single_threaded_opencv(), ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
         try:
             for shot in shots:
-                group.append(shot)
-                if len(group) == together:
-                    pending.append(pool.submit(process, group))
-                    group = []
+                ahead.append(shot)
+                if len(ahead) == most_ahead:
+                    begin(together)
                 while len(pending) > 2 * workers or (pending and pending[0].done()):
                     deliver()
                 if stop():
                     break
         finally:
-            if group:
-                pending.append(pool.submit(process, group))
+            while ahead:
+                begin(-(-len(ahead) // _AHEAD))
             while pending:
                 deliver()
     return done

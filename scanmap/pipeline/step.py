@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from scanmap.calibration import Calibration
 from scanmap.errors import CameraError
 from scanmap.laserline import (
+    Laser,
     LaserLine,
     LaserLineParams,
     Look,
     Reason,
     Rounding,
-    clear_channel,
+    laser_of,
     look,
     look_at_all,
     needs_colour,
@@ -45,7 +46,7 @@ Sink = Callable[[Step], None]
 class Pipeline:
     """What turns shots into points; the same object serves every worker, for they change nothing in it.
 
-    The laser's channel is a matter of the scan: `checked` asks the first pictures for it before any is processed.
+    The laser is a matter of the scan: `checked` asks the first pictures for it before any is processed.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class Pipeline:
         self.window: NDArray[np.float64] = column_window(calibration, triangulation)
         self.window += np.array([-slack_px, slack_px])
         self.colour = needs_colour(laserline)  # whether the line is found in colour or a grey decode will do
-        self.channel: int | None = None  # the laser's, where a picture has told it beyond doubt
+        self.laser: Laser | None = None  # where a picture has told it beyond doubt
 
     def process(self, shot: Shot, still: NDArray[np.bool_] | None = None) -> Step:
         """Decode, find the line, triangulate. A bad image gives a Step without points and its fault.
@@ -80,7 +81,7 @@ class Pipeline:
             return self._blind(shot, str(error))
         dark = background.image if background else None
         rounding = rounding_of(shot.image)
-        found = look(image.image, self.laserline, dark, self.window, still, self.channel, rounding)
+        found = look(image.image, self.laserline, dark, self.window, still, self.laser, rounding)
         return self._step(shot, found, min(image.rows_valid, background.rows_valid if background else image.rows_valid))
 
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
@@ -103,7 +104,7 @@ class Pipeline:
                 own_place[:] = image
             rows.append(whole)
             roundings.append(rounding_of(shot.image))
-        seen_by = self.laserline, self.window, self.channel, roundings
+        seen_by = self.laserline, self.window, self.laser, roundings
         looks = look_at_all(stack[: len(rows)], *seen_by) if rows else []
         seen = zip(looks, rows, strict=True)
         return [
@@ -111,14 +112,14 @@ class Pipeline:
             for k, shot in enumerate(shots)
         ]
 
-    def ask_channel(self, shot: Shot) -> bool:
-        """Let a picture tell the laser's channel; whether it leaves no doubt, or none is needed."""
+    def ask_laser(self, shot: Shot) -> bool:
+        """Let a picture tell of the laser; whether it leaves no doubt, or none is needed."""
         if self.laserline.grey != "auto":
             return True
         with suppress(CameraError):
             background = self._decode(shot.background).image if shot.background is not None else None
-            self.channel = clear_channel(self._decode(shot.image).image, self.laserline, background)
-        return self.channel is not None
+            self.laser = laser_of(self._decode(shot.image).image, self.laserline, background)
+        return self.laser is not None
 
     def _step(self, shot: Shot, found: Look, rows: int) -> Step:
         line, fault = found.line, ""
@@ -133,7 +134,7 @@ class Pipeline:
             image = self._decode(shot.image).image
         except CameraError:
             return None
-        return ridges(image, self.laserline, self.channel)
+        return ridges(image, self.laserline, self.laser)
 
     def _decode(self, data: bytes, into: Image | None = None) -> Decoded:
         decoded = decode_image(data, grey=not self.colour, into=into)
