@@ -30,7 +30,7 @@ from scanmap.recording import Recorder, open_source
 from scanmap.scan import Scan
 from scanmap.session.job import finished_scan
 from scanmap.shot import Shot, decode_image
-from scanmap.triangulation import triangulate
+from scanmap.triangulation import triangulate_all
 
 WIDTH, HEIGHT = 1600, 1200
 DISTINCT = 24
@@ -130,13 +130,13 @@ def main() -> None:
     parts: dict[str, Callable[[int], object]] = {
         f"{name} to {planes}": lambda k, decode=decode: decode(jpegs[k % DISTINCT]) for name, decode in decoders.items()
     }
-    parts["triangulation"] = lambda k: triangulate(lines[k % TOGETHER], head, config.triangulation)
+    parts[f"triangulation, {TOGETHER} at once"] = lambda k: triangulate_all(lines, head, config.triangulation)
     for together in (1, TOGETHER):
         parts[f"laser line, {together} at once"] = lambda k, some=images[:together]: [
             look_at_all(some, config.laserline, pipeline.window, laser) for _ in range(TOGETHER // len(some))
         ]
     for name, action in parts.items():
-        frames_each = TOGETHER if name.startswith("laser") else 1
+        frames_each = TOGETHER if "at once" in name else 1
         print(f"{name:28s} {cpu_ms(action, 40) / frames_each:7.2f} ms CPU a frame")
 
     with tempfile.TemporaryDirectory() as folder:

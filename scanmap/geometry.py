@@ -107,7 +107,8 @@ def intersect_rays_plane(origin: Array, directions: Array, plane: Array) -> Arra
 
     NaN where a ray is parallel to the plane; negative behind the origin.
     """
-    along = directions @ plane[:3]
+    # Not BLAS, whose sums depend on how many rays there are.
+    along = directions[..., 0] * plane[0] + directions[..., 1] * plane[1] + directions[..., 2] * plane[2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         t = -(plane[:3] @ origin + plane[3]) / along
     met: Array = np.where(np.isfinite(t), t, np.nan)

@@ -16,7 +16,6 @@ from scanmap.laserline import (
     Laser,
     LaserLine,
     LaserLineParams,
-    Look,
     Reason,
     Rounding,
     laser_of,
@@ -27,7 +26,7 @@ from scanmap.laserline import (
     rounding_of,
 )
 from scanmap.shot import Decoded, Image, Shot, decode_image
-from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate
+from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate, triangulate_all
 
 
 class Step(NamedTuple):
@@ -82,7 +81,9 @@ class Pipeline:
         dark = background.image if background else None
         rounding = rounding_of(shot.image)
         found = look(image.image, self.laserline, dark, self.window, still, self.laser, rounding)
-        return self._step(shot, found, min(image.rows_valid, background.rows_valid if background else image.rows_valid))
+        rows = min(image.rows_valid, background.rows_valid if background else image.rows_valid)
+        line, fault = _cut(found.line, rows)
+        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
 
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
         """What `process` gives for each of the shots, bit for bit, sooner."""
@@ -106,11 +107,17 @@ class Pipeline:
             roundings.append(rounding_of(shot.image))
         seen_by = self.laserline, self.window, self.laser, roundings
         looks = look_at_all(stack[: len(rows)], *seen_by) if rows else []
-        seen = zip(looks, rows, strict=True)
-        return [
-            self._blind(shot, faults[k]) if k in faults else self._step(shot, *next(seen))
-            for k, shot in enumerate(shots)
-        ]
+        cuts = [_cut(found.line, whole) for found, whole in zip(looks, rows, strict=True)]
+        profiles = triangulate_all([line for line, _ in cuts], self.calibration, self.triangulation) if rows else []
+        seen = zip(cuts, profiles, looks, strict=True)
+        steps = []
+        for k, shot in enumerate(shots):
+            if k in faults:
+                steps.append(self._blind(shot, faults[k]))
+            else:
+                (line, fault), profile, found = next(seen)
+                steps.append(Step(shot, line, profile, fault, found.places))
+        return steps
 
     def ask_laser(self, shot: Shot) -> bool:
         """Let a picture tell of the laser; whether it leaves no doubt, or none is needed."""
@@ -120,13 +127,6 @@ class Pipeline:
             background = self._decode(shot.background).image if shot.background is not None else None
             self.laser = laser_of(self._decode(shot.image).image, self.laserline, background)
         return self.laser is not None
-
-    def _step(self, shot: Shot, found: Look, rows: int) -> Step:
-        line, fault = found.line, ""
-        if rows < len(line.reason):
-            line = _without_rows(line, rows)
-            fault = f"image is cut: {rows} of {len(line.reason)} rows are whole"
-        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
 
     def ridges(self, shot: Shot) -> NDArray[np.uint8] | None:
         """What of a shot's image looks like a line, as `laserline.ridges` has it; None where it cannot be read."""
@@ -162,8 +162,12 @@ def _memory(shape: tuple[int, ...]) -> Image:
     return np.asarray(_own.bytes[:size].reshape(shape))
 
 
-def _without_rows(line: LaserLine, first: int) -> LaserLine:
-    """The line with every row from `first` on given up as damaged."""
-    damaged = np.arange(len(line.reason)) >= first
+def _cut(line: LaserLine, whole: int) -> tuple[LaserLine, str]:
+    """The line with the rows of a damaged picture given up of which only the first are `whole`, and what to say."""
+    rows = len(line.reason)
+    if whole >= rows:
+        return line, ""
+    damaged = np.arange(rows) >= whole
     column, peak, width, sigma = (np.where(damaged, np.nan, values) for values in line[:4])
-    return LaserLine(column, peak, width, sigma, np.where(damaged, Reason.DAMAGED, line.reason).astype(np.uint8))
+    cut = LaserLine(column, peak, width, sigma, np.where(damaged, Reason.DAMAGED, line.reason).astype(np.uint8))
+    return cut, f"image is cut: {whole} of {rows} rows are whole"
