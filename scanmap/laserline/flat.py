@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,8 @@ _FLAT = 0.88  # of the height there from which on the top is flat
 _NEARBY = 10  # rows of a run on either side of one that are asked with it
 _LEAST_ROWS, _LEAST_ASKED = 4, 3
 _ENOUGH_ROWS = 700
+_MANY_ROWS, _FEWER = 100, 4  # of so many rows so many times fewer are asked first
+_DOUBT = 0.05  # of the height that these may lack of flat for those around them to be asked
 _SURE = 3.0  # standard errors of its mean that a stretch's flatness must exceed
 
 
@@ -40,20 +43,23 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mas
     if len(row) < _LEAST_ROWS:
         return flat
     run = numbered(row, column[row], 2, height)
-    # Of many rows some tell of all.
+    # Of many rows some tell of all, and of most runs a few that they are not.
     picture = row // height
-    step = (1 + np.bincount(picture) // _ENOUGH_ROWS)[picture]
-    asked = row % height % step == 0
+    count = np.bincount(picture)
+    step = 1 + count // _ENOUGH_ROWS
+    fewer, step = np.where(count < _MANY_ROWS, step, _FEWER * step)[picture], step[picture]
+    place = row % height
+    few = row[place % fewer == 0]
+    excess, top, _ = _profiles(plane, few, column, width)
+    near = np.zeros((len(flat) // height, height), np.uint8)
+    near.ravel()[few[excess > -_DOUBT * top]] = 1
+    near = np.asarray(cv2.dilate(near, np.ones((1, 4 * _NEARBY + 1), np.uint8)))
+    asked = (place % step == 0) & (near.ravel()[row] > 0)
+    if not asked.any():
+        return flat
     every, by_run = row, run
     row, run, step = row[asked], run[asked], step[asked]
-    at = column[row] + np.array([[0.0], [-_AT], [_AT], [-3.0], [3.0]]) * width[row]
-    middle, left, right, below_left, below_right = _sampled(plane, row, at)
-    shoulder = np.minimum(left - below_left, right - below_right)
-    top = middle - np.maximum(below_left, below_right)
-    clipped = middle >= SATURATED
-    excess = shoulder - _FLAT * top
-    if not (excess > 0.0).any():
-        return flat
+    excess, top, clipped = _profiles(plane, row, column, width)
     total = np.zeros((5, len(row) + 1))
     np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
     index, reach = np.arange(len(row)), np.maximum(2, _NEARBY // step)
@@ -68,6 +74,15 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mas
     for ask in (np.maximum(after - 1, 0), np.minimum(after, len(row) - 1)):
         flat[every] |= sure[ask] & (run[ask] == by_run)
     return flat
+
+
+def _profiles(plane: U8, row: Index, column: F64, width: F64) -> tuple[F64, F64, Mask]:
+    """How much higher than a Gaussian's may be the shoulders of lines at rows (N,) are, their tops, if those are cut."""
+    at = column[row] + np.array([[0.0], [-_AT], [_AT], [-3.0], [3.0]]) * width[row]
+    middle, left, right, below_left, below_right = _sampled(plane, row, at)
+    shoulder = np.minimum(left - below_left, right - below_right)
+    top = middle - np.maximum(below_left, below_right)
+    return shoulder - _FLAT * top, top, middle >= SATURATED
 
 
 def _sampled(plane: U8, row: Index, column: F64) -> F64:
