@@ -199,6 +199,14 @@ def test_an_even_picture_has_no_line(level):
     assert (line.reason != Reason.OK).all()
 
 
+def test_a_line_drawn_by_a_computer_scatters_nothing_and_is_found():
+    u, height = np.arange(200.0), np.repeat([[180.0], [60.0]], 200, axis=0)
+    image = np.rint(10.0 + height * np.exp(-0.5 * ((u - 100.0) / 2.0) ** 2)).astype(np.uint8)
+    line = find_laser_line(image, LaserLineParams())
+    np.testing.assert_allclose(line.column_px, 100.0, atol=1e-3)
+    assert (line.sigma_px > 0.0).all()
+
+
 @pytest.mark.parametrize("noise", [1.0, 3.0, 6.0])
 def test_noise_alone_has_no_line(noise):
     found = [

@@ -84,7 +84,7 @@ def unexplained_by_height(column: Array, sigma: Array, start: Index, lags: tuple
     for k, told in enumerate(_fourth_differences(column, sigma, start, lags)):
         factor[k] = of_all = _typical([ratio for _, ratio in told])
         octaves = np.unique(octave[k][np.isfinite(column[k])])
-        for one in octaves if np.isfinite(of_all) and len(octaves) > 1 else ():
+        for one in octaves if of_all > 0.0 and len(octaves) > 1 else ():
             some = [ratio[octave[k][at] == one] for at, ratio in told]
             own, count = _typical(some), min(map(len, some))
             if np.isfinite(own):
