@@ -19,7 +19,7 @@ from scanmap.laserline.edges import across_edges, doubt_of_edges, sides_of
 from scanmap.laserline.error_bars import Doubts, no_doubts, with_error_bars
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
-from scanmap.laserline.offframe import standing_out
+from scanmap.laserline.offframe import borne_out, standing_out
 from scanmap.laserline.offmatch import in_place
 from scanmap.laserline.onward import goes_on
 from scanmap.laserline.params import LaserLineParams
@@ -216,8 +216,10 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
         line = without(line, standing < _STANDS_OUT[0], Reason.AMBIGUOUS)
         # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
         disturbed = with_ripple < _STANDS_OUT[1]
+        borne = borne_out(line.column_px, disturbed | weak, _BLOCKS_ROWS, sight.lit, sight.off, sight.gain)
+        disturbed &= ~borne
         line = without(line, runs.crumbs(line.column_px, disturbed, height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
-        weak |= disturbed
+        weak = (weak | disturbed) & ~borne
     line = without(line, runs.crumbs(line.column_px, weak, height), Reason.AMBIGUOUS)
     line.column_px[:] += doubts.edges.shift
     return with_error_bars(line, sight, params.pool_rows, doubts)

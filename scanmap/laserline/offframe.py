@@ -6,8 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline.path import strips
+from scanmap.laserline.runs import GAP_ROWS, numbered
+
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 _REACH = 2  # [px] on either side of a place whose contrast counts
 _CONTRAST = 16  # [grey levels] from which on a place has any
@@ -16,6 +20,12 @@ _ROW_STEP = 8
 _FEW = 50
 _RIPPLE_REACH, _RIPPLE = 6, 0.5  # [px] around a place, and the part of what is missing there that counts
 _SHARE = 0.04  # of a contrast that a shaken camera leaves besides
+# A run, asked along it as a whole: rows that it has at least, and how far they lie from a straight line.
+_RUN_ROWS, _STRAIGHT_PX = 4, 0.8
+# Columns on either side that are asked besides, from where on they are not its own, and how far their sides are [px].
+_HALF, _BESIDE_PX, _AWAY_PX = 40, 9, 6
+# How much higher a run is than all of those, and than what neighbouring columns of the laser-off frame differ by.
+_HIGHER, _STEEPER = 2.0, 1.5
 
 
 def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> tuple[F64, F64]:
@@ -62,3 +72,42 @@ def _remaining(image: U8, background: U8, gain: float) -> float:
         return 0.0
     left = np.abs(on[usable] - gain * off[usable].astype(np.float32))
     return float(1.48 * np.median(left))
+
+
+def borne_out(column: F64, doubtful: Mask, most: int, lit: U8, background: U8, gain: float) -> Mask:
+    """Rows (H,) of runs, most of them doubtful, that are the line beyond doubt in their mean along a straight line.
+
+    Args:
+        column: (H,) of the line, NaN where none.
+        doubtful: (H,) rows that could not be told alone.
+        most: rows that a run in question has at most.
+        lit: (H, W) what the laser added.
+        background: (H, W) laser off.
+        gain: that it is multiplied by.
+
+    What two compressions differ by comes with both signs and at all columns of these rows alike: averaged along the
+    line it is told by the other columns. What an edge leaves that is not quite in its place lies along the line too,
+    but is no higher than the edge is steep.
+    """
+    borne = np.zeros(len(column), bool)
+    row = np.flatnonzero(np.isfinite(column))
+    if not doubtful.any() or lit.shape[1] <= 2 * _HALF:
+        return borne
+    run = numbered(row, column[row], GAP_ROWS + 1, len(column))
+    length = np.bincount(run)
+    short = (length >= _RUN_ROWS) & (length <= most)
+    for k in np.flatnonzero(short & (np.bincount(run, doubtful[row]) > 0.5 * length)):
+        rows = row[run == k]
+        slope, middle = np.polyfit(rows - rows[0], column[rows], 1)
+        along = middle + slope * (rows - rows[0])
+        if np.std(column[rows] - along) > _STRAIGHT_PX:
+            continue
+        along = np.clip(np.rint(along).astype(np.intp), 0, lit.shape[1] - 1)
+        added, room = (strips(plane, rows, along, _HALF).mean(axis=1) for plane in (lit, background))
+        rise = added[_AWAY_PX:-_AWAY_PX] - np.maximum(added[: -2 * _AWAY_PX], added[2 * _AWAY_PX :])
+        own = len(rise) // 2
+        missing = np.median(added) - added.min()
+        beside = max(rise[: own - _BESIDE_PX].max(), rise[own + _BESIDE_PX + 1 :].max(), missing)
+        steep = gain * np.abs(np.diff(room[_HALF - _REACH - 1 : _HALF + _REACH + 2])).max()
+        borne[rows] = rise[own - 1 : own + 2].max() > max(_HIGHER * beside, _STEEPER * steep)
+    return borne
