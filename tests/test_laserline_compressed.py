@@ -102,6 +102,32 @@ def test_a_saturated_upright_line_is_not_moved_by_smeared_colour(phase: float) -
     assert abs(np.nanmean(off)) < 0.02 and np.nanstd(off) < 0.03
 
 
+def test_a_cut_core_in_a_grey_jpeg_is_told_by_its_flanks_alone() -> None:
+    """Of the cut top JPEG makes samples below saturation, too. Taken for the line's own they move it by 0.1 px."""
+    for peak, sigma, limit in ((500.0, 2.0, 0.025), (400.0, 1.5, 0.03), (300.0, 3.0, 0.025)):
+        spec = LineSpec(height=480, width=400, peak=peak, sigma=sigma, noise=1.5)
+        off, scaled = errors(spec, ALONE, 85, "422", seeds=range(4))
+        assert np.isfinite(off).all()
+        assert np.sqrt(np.mean(off**2)) < limit
+        assert 0.8 < np.sqrt(np.mean(scaled**2)) < 1.15
+
+
+@pytest.mark.parametrize("laser", [RED, GREEN], ids=["red", "green"])
+def test_smeared_colour_beside_a_cut_core_is_no_halo(laser) -> None:
+    """What smeared colour leaves of the flanks is no Gaussian; in brightness they are. As a halo's core: 0.1 px off."""
+    for seed, over in enumerate((2.2, 3.0, 4.5, 4.5)):
+        rng = np.random.default_rng(seed)
+        column = rng.uniform(140.0, 156.0) + 0.002 * np.arange(320)
+        bell = np.exp(-0.5 * ((np.arange(300.0) - column[:, None]) / rng.uniform(2.3, 3.4)) ** 2)[..., None]
+        light = 255.0 * (over * bell * np.array(laser) + 0.05) + 2.0 * rng.standard_normal((320, 300, 3))
+        data = compressed(np.clip(np.rint(light), 0, 255).astype(np.uint8), 85, ("422", "420")[seed % 2])
+        line = find_laser_line(data, ALONE)
+        off = line.column_px - column
+        assert np.isfinite(off).mean() > 0.99
+        assert np.sqrt(np.nanmean(off**2)) < 0.05
+        assert np.nanmedian(line.sigma_px) < 0.05
+
+
 @pytest.mark.parametrize(
     ("quality", "subsampling", "limit"),
     [(75, "420", 0.025), (85, "422", 0.015), (90, "422", 0.0125)],  # of 0.7 red and 0.3 green: 0.036, 0.026, 0.018

@@ -9,35 +9,39 @@ from scanmap.laserline.peaks import Peaks, fit_gaussian
 from scanmap.laserline.pictures import not_one
 from scanmap.laserline.samples import Samples
 
+F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 
 # Brightness places a saturated core at most this far [px] from where its flanks do, and not much less surely.
 _SAME_PX, _NO_WORSE = 1.0, 2.0
-# A line without a halo is as wide in it, and a Gaussian but for its top, cut flat: that share of its height is misfit.
-# Beyond the last width [px] it is a bar, whose edges tell more.
-_AS_WIDE, _FLAT_MISFIT, _BAR_PX = 0.9, 0.055, 5.0
+_BAR_PX = 7.0  # wider, it is a bar, whose edges tell more
 
 
 def by_brightness(
-    peaks: Peaks, good: NDArray[np.bool_], around: Samples, half: int, some: Index | slice
-) -> tuple[Peaks, NDArray[np.bool_]]:
+    peaks: Peaks,
+    good: NDArray[np.bool_],
+    halo: NDArray[np.bool_],
+    misfit: F32,
+    around: Samples,
+    half: int,
+    some: Index | slice,
+) -> Peaks:
     """The peaks, those with a saturated core placed by brightness, where colour was compressed.
 
-    With them (N,) which are as wide in brightness as in the laser's channel, and a Gaussian but for their cut top: what
-    does not fit there is smeared colour, not a halo, for a halo is dimmer in the other channels.
+    Its flanks are a Gaussian's up to where the laser's channel is cut. What looked like a `halo` (N,) is none where
+    they are: it was smeared colour. Where they scatter by more than `misfit` (N,) [grey levels] too, it is one.
     """
-    even = np.zeros(len(good), bool)
     smeared = around.smeared[some]
     again = not_one(np.flatnonzero(peaks.clipped & good & smeared & (peaks.width_px < _BAR_PX)))
     if around.beside is None or not again.size:
-        return peaks, even
+        return peaks
     rows = again if isinstance(some, slice) else some[again]
-    found = fit_gaussian(*around.brightness_of(half, rows), around.rows.of(rows), peaks.contrast)
+    y, usable, cut = around.brightness_of(half, rows)
+    found = fit_gaussian(y, usable, around.rows.of(rows), peaks.contrast, limit=cut)
     agrees = np.abs(found.offset_px - peaks.offset_px[again]) < _SAME_PX
     agrees &= (found.sigma_px < _NO_WORSE * peaks.sigma_px[again]) & ~found.one_sided
-    even[again] = agrees & (found.width_px > _AS_WIDE * peaks.width_px[again])
-    even[again] &= found.noise < _FLAT_MISFIT * found.height
     at = again[agrees]
     offset, sigma, bias = peaks.offset_px.copy(), peaks.sigma_px.copy(), peaks.bias_px.copy()
     offset[at], sigma[at], bias[at] = found.offset_px[agrees], found.sigma_px[agrees], found.bias_px[agrees]
-    return peaks._replace(offset_px=offset, sigma_px=sigma, bias_px=bias), even
+    halo[at] &= found.noise[agrees] > misfit[at]
+    return peaks._replace(offset_px=offset, sigma_px=sigma, bias_px=bias)

@@ -241,10 +241,14 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         noise = rows.noise
         y, usable = around.of(half, some)
         sides = sides_of(y, rows)
-        peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some))
+        limit = around.limit_of(usable)
+        peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some), limit)
         contrasts = peaks.contrast
         reason = judged(peaks, noise, params)
-        peaks, even = by_brightness(peaks, reason == Reason.OK, around, half, some)
+        # A wide saturated line whose flanks are no Gaussian's stands in a halo.
+        misfit = np.float32(_HALO_MISFIT) * np.maximum(noise, np.float32(1.5))
+        halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & (peaks.noise > misfit)
+        peaks = by_brightness(peaks, reason == Reason.OK, halo, misfit, around, half, some)
         if sight.off is None:
             own = across_edges(peaks, reason == Reason.OK, sides, around, half, some)
         else:
@@ -256,11 +260,8 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
             reason[runs.continuing(r, c + peaks.offset_px, peaks.sigma_px, believed, dim, sight.height)] = Reason.OK
         good = reason == Reason.OK
         if params.method == "gauss" and not (good.all() and not peaks.clipped.any()):
-            # A wide saturated line whose flanks are no Gaussian's stands in a halo.
-            misfit = peaks.noise > _HALO_MISFIT * np.maximum(noise, 1.5)
-            halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & misfit & ~even
             reason[halo & good] = Reason.WIDE
-            final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & ~misfit)
+            final = (reason == Reason.EDGE) | ((reason == Reason.WIDE) & (peaks.noise <= misfit))
             lost = (reason != Reason.OK) & ~final
             take_cores(line, (r[lost], c[lost]), y[:, lost].T, params.max_width_px, rows.of(lost), params)
             good = reason == Reason.OK

@@ -66,7 +66,12 @@ class Peaks(NamedTuple):
 
 
 def fit_gaussian(
-    y: F32, usable: F32, rows: Rows, contrast: F64, samples: Callable[[int], tuple[F32, F32]] | None = None
+    y: F32,
+    usable: F32,
+    rows: Rows,
+    contrast: F64,
+    samples: Callable[[int], tuple[F32, F32]] | None = None,
+    limit: F32 | None = None,
 ) -> Peaks:
     """Fit b + A exp(-(x - u)^2 / 2 s^2) to each row's window.
 
@@ -76,6 +81,7 @@ def fit_gaussian(
         rows: N >= 2 of P pictures.
         contrast: (P,) of the speckle; NaN: judged from the residuals.
         samples: gives y and usable for another half width of the window.
+        limit: (N,) grey levels at which the lines are cut, infinite where they are whole; None: all of them are.
 
     Gauss-Newton on four parameters, saturated samples left out: the maximum-likelihood estimate for additive
     Gaussian noise, whose bound for u is 2 s_n^2 s / (sqrt(pi) A^2) (Cramer-Rao; Hagen and others 2007). Under
@@ -83,7 +89,8 @@ def fit_gaussian(
     """
     n, noise = len(y), rows.noise
     x = (np.arange(n, dtype=np.float32) - n // 2)[:, None]
-    cut = (usable.min(axis=0) < 1).nonzero()[0]  # rows with samples that say little
+    limit = np.full(y.shape[1], np.inf, np.float32) if limit is None else limit
+    cut = ((usable.min(axis=0) < 1) | (limit < np.inf)).nonzero()[0]  # rows with samples that say little
     clipped = np.zeros(y.shape[1], bool)
     clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
     y, low, high = levelled(y, x, noise)
@@ -95,13 +102,15 @@ def fit_gaussian(
     if part.size:
         # What is left of a clipped line needs more of its background to be told four parameters from.
         least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
-        fit = fit.with_rows(part, fit_part(y.take(part, axis=1), x, usable.take(part, axis=1), start.of(part), least))
+        taken = y.take(part, axis=1), x, usable.take(part, axis=1), start.of(part)
+        fit = fit.with_rows(part, fit_part(*taken, least, limit[part]))
     dim = dim_rows(y, x, cut, fit.s, fit.A, rows)
     if dim is not None:
         fit = fit.with_rows(dim.rows, Fit(dim.u, dim.s, dim.A, dim.b, dim.s * np.float32(0.5 * ROOT_PI)))
     look = Leftover(y, x, fit)
     if part.size:
         look.weight[:, part] = usable.take(part, axis=1) * near(x, fit.of(part), REACH, least)
+        look.weight[:, part] *= look.bell[:, part] * fit.A[part] < (limit - fit.b)[part]
     unknown = np.isnan(contrast)
     if unknown.any():
         judged = speckle_contrasts(look.residual, look.bell, fit.A, look.weight, rows)
@@ -115,7 +124,7 @@ def fit_gaussian(
         x = (np.arange(len(y), dtype=np.float32) - len(y) // 2)[:, None]
         y, _, _ = levelled(y, x, noise)
     y, usable, some = y.take(speckled, axis=1), usable.take(speckled, axis=1), rows.of(speckled)
-    fit, weight = _fit_speckle(y, x, usable, fit.of(speckled), some, contrast)
+    fit, weight = _fit_speckle(y, x, usable, fit.of(speckled), some, contrast, limit[speckled])
     look = Leftover(y, x, fit)
     look.weight = weight
     cut = np.isin(speckled, cut).nonzero()[0]
@@ -173,7 +182,7 @@ def _peaks(
     return Peaks(fit.u, sigma, fit.s, A, np.sqrt(variance), bias, clipped, one_sided, np.zeros(0))
 
 
-def _fit_speckle(y: F32, x: F32, usable: F32, fit: Fit, rows: Rows, contrasts: F64) -> tuple[Fit, F32]:
+def _fit_speckle(y: F32, x: F32, usable: F32, fit: Fit, rows: Rows, contrasts: F64, limit: F32) -> tuple[Fit, F32]:
     """The fit again, its samples weighted by the model's own variance; and the weights (n, N)."""
     floor = np.square(np.maximum(rows.noise, np.float32(0.5)))
     contrast = contrasts.astype(np.float32)[rows.picture]
@@ -187,7 +196,7 @@ def _fit_speckle(y: F32, x: F32, usable: F32, fit: Fit, rows: Rows, contrasts: F
     for _ in range(ITERATIONS):
         variance = floor + np.square(contrast * model.A * bell_of(x, model))
         weight = usable * near(x, model, _SPECKLE_REACH) * (floor / variance)
-        model = improve(y, x, weight, model)
+        model = improve(y, x, weight, model, limit)
     return model, weight
 
 

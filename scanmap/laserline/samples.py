@@ -49,8 +49,20 @@ class Samples(NamedTuple):
             usable &= ~_some(self.outside[span], some)
         return y, usable.astype(np.float32)
 
-    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32]:
-        """The same in what JPEG stores as brightness; only where `beside` is known.
+    def limit_of(self, usable: F32) -> F32:
+        """At what grey level (n,) the lines are cut whose `usable` samples (2 half + 1, n) these are; infinite: not.
+
+        Of a top that was cut a JPEG makes samples above and below the level: where the line itself is higher, none
+        says more than "bright". With a laser-off frame the level is another one in each column, and not told.
+        """
+        middle = len(usable) // 2
+        cut = (usable[middle - 1 : middle + 2].min(axis=0) < 1) & (self.lit is self.seen)
+        return np.where(cut, np.float32(SATURATED), np.float32(np.inf))
+
+    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32, F32]:
+        """The same in what JPEG stores as brightness, and where (n,) the laser's channel is cut in it.
+
+        Only where `beside` is known.
 
         Where the laser's channel saturates, colour, smeared over two columns and more, moves what is decoded of its
         flanks by up to a tenth of a pixel, in all rows of an upright line alike. Brightness is not smeared, and the
@@ -65,7 +77,15 @@ class Samples(NamedTuple):
         share = np.float32(BRIGHTNESS[self.channel])
         brightness: F32 = own * share
         brightness += beside * (np.float32(1.0) - share)
-        return brightness, usable.astype(np.float32)
+        # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut.
+        own, beside = own.astype(np.float32), beside.astype(np.float32)
+        low, low_beside = np.minimum(*ends(own)), np.minimum(*ends(beside))
+        flank = own < SATURATED
+        seen = (flank * (beside - low_beside)).sum(axis=0) / np.maximum(
+            (flank * (own - low)).sum(axis=0), np.float32(1.0)
+        )
+        cut = share * SATURATED + (np.float32(1.0) - share) * (low_beside + seen * (SATURATED - low))
+        return brightness, usable.astype(np.float32), cut
 
 
 def _some(values: NDArray[Any], some: Index | slice) -> NDArray[Any]:

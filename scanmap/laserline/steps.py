@@ -117,16 +117,16 @@ def _improve_whole(x: F32, look: Leftover, fit: Fit) -> Fit:
     return Fit(u, s, A, b, s * np.float32(0.5 * ROOT_PI))
 
 
-def fit_part(y: F32, x: F32, usable: F32, fit: Fit, least: F32) -> Fit:
-    """The fits (M,) of rows that lack samples, or whose sums are not the integrals."""
+def fit_part(y: F32, x: F32, usable: F32, fit: Fit, least: F32, limit: F32) -> Fit:
+    """The fits (M,) of rows that lack samples, or whose sums are not the integrals; see `improve`."""
     # They have farther to go than rows with a whole line.
     for _ in range(2 * ITERATIONS):
-        fit = improve(y, x, usable * near(x, fit, REACH, least), fit)
+        fit = improve(y, x, usable * near(x, fit, REACH, least), fit, limit)
     return fit
 
 
-def improve(y: F32, x: F32, weight: F32, fit: Fit) -> Fit:
-    """One Gauss-Newton step."""
+def improve(y: F32, x: F32, weight: F32, fit: Fit, limit: F32) -> Fit:
+    """One Gauss-Newton step from the samples at which the fit is below its row's `limit` (M,)."""
     basis = np.empty((5, *y.shape), np.float32)
     level, g, q, d, basis[4] = *basis[:4], y
     z = (x - fit.u) / fit.s
@@ -134,6 +134,7 @@ def improve(y: F32, x: F32, weight: F32, fit: Fit) -> Fit:
     np.exp(np.float32(-0.5) * z * z, out=g)
     np.multiply(g, z, out=d)  # derivative by u, times s / A
     np.multiply(d, z, out=q)  # derivative by s, times s / A
+    weight = weight * (g * fit.A < limit - fit.b)
     # Normal equations of (b, A, s, u), upper triangle, and their right side.
     normal = np.zeros((4, 5, y.shape[1]))
     for i, own in enumerate((weight, weight * g, weight * q, weight * d)):
