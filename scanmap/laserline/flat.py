@@ -77,7 +77,7 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mas
 
 
 def _profiles(plane: U8, row: Index, column: F64, width: F64) -> tuple[F64, F64, Mask]:
-    """By how much the shoulders of lines at rows (N,) are too high for a Gaussian, their tops, and whether they are cut."""
+    """How much too high for a Gaussian lines at rows (N,) are at their shoulders; their tops, and if those are cut."""
     at = column[row] + np.array([[0.0], [-_AT], [_AT], [-3.0], [3.0]]) * width[row]
     middle, left, right, below_left, below_right = _sampled(plane, row, at)
     shoulder = np.minimum(left - below_left, right - below_right)

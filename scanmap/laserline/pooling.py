@@ -170,11 +170,9 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     # A window for every row of the picture, or only those asked for.
     few = 4 * len(at) < len(y)
     asked: Index | slice = first if few else slice(None)
-    windows = [np.ascontiguousarray(_windows(values, rows)[:, asked]) for values in (weight, wy, wy * y)]
-    # Not BLAS, whose sums depend on how many windows there are.
-    m0, m1, m2, m3, m4 = np.einsum("kr,rn->kn", powers, windows[0])
-    r0, r1, r2 = np.einsum("kr,rn->kn", powers[:3], windows[1])
-    q0 = windows[2].sum(axis=0)
+    m0, m1, m2, m3, m4 = (np.correlate(weight, power)[asked] for power in powers)
+    r0, r1, r2 = (np.correlate(wy, power)[asked] for power in powers[:3])
+    q0 = np.correlate(wy * y, powers[0])[asked]
     # The straight line first, then what the bend adds to it, orthogonal to it.
     per_det = 1.0 / (m0 * m2 - m1 * m1 + 1e-9 * m0 * m0 + 1e-30)
     c0, c1 = (m2 * r0 - m1 * r1) * per_det, (m0 * r1 - m1 * r0) * per_det
@@ -224,9 +222,3 @@ def _powers(rows: int) -> Array:
     """Powers 0 to 4 (5, rows) of the places in a window, from about -1 to 1."""
     t = (np.arange(rows) - rows // 2) * (2.0 / rows)
     return np.asarray(t ** np.arange(5)[:, None], np.float64)
-
-
-def _windows(values: Array, rows: int) -> Array:
-    """All windows of so many values (rows, H - rows + 1), a view."""
-    step = values.strides[0]
-    return np.ndarray((rows, len(values) - rows + 1), values.dtype, values, 0, (step, step))
