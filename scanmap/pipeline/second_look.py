@@ -10,11 +10,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import BLOCK, Reason, ridge_of
+from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
@@ -27,13 +29,29 @@ U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Shots = Callable[[], Iterable[Shot]]
 
+_TURNS = 3  # after the first the neighbours are asked, of which the first made sense
 _LOOKS = 3  # each may show what was hidden behind the last
 _LEAST_ROWS = 8  # of a picture that are worth another look
 _DIM, _UNCLIPPED = 0.0025, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
 _AROUND_PX = 8  # beside a line that is none, nothing is looked for
 _APART = float(np.radians(2.9))  # between pictures that are compared with others
-_SUSPECT = 0.4  # share of the pictures that must list a place as line-like, for some of all to be read again
+_SUSPECT = 2 / 3  # of the share that is asked of pictures, where they list what is like a line, to read them again
+# A line found where others are hidden stands out of its picture this near, by such a part of what its height and width
+# are worth, or by so many grey levels where these are not known.
+_WITHIN_PX, _SHOWN, _LEAST_SHOWN = 2, 0.25, 2.0
 _NEXT = 1.5  # times that, within which what stands beside a picture is asked in others too
+
+
+class _Known(NamedTuple):
+    """What a sweep knows at one moment."""
+
+    still: StillThings
+    neighbours: Neighbours | None
+    usual: float  # reflectance
+
+    def share(self, k: int, range_m: F32 | F64) -> F64:
+        """As `Neighbours.share` has it; the same for all while they are not known."""
+        return np.full(len(range_m), SHARE) if self.neighbours is None else self.neighbours.share(k, range_m)
 
 
 class SecondLook:
@@ -45,6 +63,7 @@ class SecondLook:
         self._reflectance: list[F32] = []
         self._ridge: list[F32] = []
         self._places: list[F32 | None] = []
+        self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
 
     def __call__(self, step: Step) -> None:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
@@ -62,30 +81,49 @@ class SecondLook:
             without: bearings of the scan, by their index, that are left alone and say nothing.
         """
         asked = [k for k in range(len(scan)) if k not in without]
-        usual = self._usual()
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
-        still = self._listed(scan, views)
-        # Most scans of plain rooms need not be read again.
-        if shots is not None and any(self._stands(scan, k, still, _SUSPECT).sum() >= _LEAST_ROWS for k in views):
-            still = self._shown(scan, views, shots())
+        # At first, many of the neighbours are as wrong.
+        known, shown, total = _Known(self._listed(scan, views), None, self._usual()), False, 0
+        for _ in range(_TURNS):
+            # Most scans of plain rooms need not be read again.
+            if shots is not None and not shown and self._suspected(scan, views, known):
+                known, shown = known._replace(still=self._shown(scan, views, shots())), True
+            wrong = self._wrong(scan, asked, views, known)
+            total += int(wrong.sum())
+            again = wrong.sum(axis=1) >= _LEAST_ROWS
+            if shots is None or not again.any():
+                scan.give_up(wrong, Reason.AMBIGUOUS)
+            else:
+                self._look_again(scan, wrong, again, known, shots())
+            if known.neighbours is not None and not wrong.any():
+                break
+            known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
+        return total
+
+    def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
+        """Whether what was taken for the line in one of the views may be among the things that were listed."""
+        return any(self._stands(scan, k, known, _SUSPECT).sum() >= _LEAST_ROWS for k in views)
+
+    def _wrong(self, scan: Scan, asked: list[int], views: list[int], known: _Known) -> Mask:
+        """The cells (B, H) that show another thing than the line."""
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
             with np.errstate(invalid="ignore"):
-                wrong[k] = self._reflectance[k] < _DIM * usual
+                wrong[k] = self._reflectance[k] < _DIM * known.usual
         for k in views:
-            wrong[k] |= self._stands(scan, k, still)
+            wrong[k] |= self._stands(scan, k, known)
         for k in _beside(scan.bearings, asked, views, [k for k in views if wrong[k].any()]):
-            wrong[k] |= self._stands(scan, k, still)
-        wrong &= scan.valid
-        again = wrong.sum(axis=1) >= _LEAST_ROWS
-        if shots is None or not again.any():
-            scan.give_up(wrong, Reason.AMBIGUOUS)
-        else:
-            self._look_again(scan, wrong, again, still, usual, shots())
-        return int(wrong.sum())
+            wrong[k] |= self._stands(scan, k, known)
+        return wrong & scan.valid
 
-    def _stands(self, scan: Scan, k: int, still: StillThings, share: float = SHARE) -> Mask:
-        return still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k], share)
+    def _stands(self, scan: Scan, k: int, known: _Known, part: float = 1.0) -> Mask:
+        """Rows (H,) that stand still: of all, or once neighbours are known, of those that these do not bear out."""
+        column, share = scan.column_px[k], known.share(k, scan.range_m[k])
+        if known.neighbours is not None:
+            column = np.where(share < SHARE, column, np.nan)
+            if np.isfinite(column).sum() < _LEAST_ROWS:
+                return np.zeros(scan.rows, bool)
+        return known.still.line(float(scan.bearings[k]), column, self._ridge[k], part * share)
 
     def _usual(self) -> float:
         known = np.concatenate(
@@ -115,15 +153,12 @@ class SecondLook:
             still.add(float(scan.bearings[k]), np.repeat(ridges, 2, axis=0))
         return still
 
-    def _look_again(
-        self, scan: Scan, wrong: Mask, again: Mask, still: StillThings, usual: float, shots: Iterable[Shot]
-    ) -> None:
+    def _look_again(self, scan: Scan, wrong: Mask, again: Mask, known: _Known, shots: Iterable[Shot]) -> None:
         """Give up the cells `wrong` (B, H), and fill those without a point of the pictures `again` (B,)."""
         places: dict[tuple[float, float], list[int]] = {}
-        masks = {}
         for k in map(int, np.flatnonzero(again)):
             places.setdefault(self._keys[k], []).append(k)
-            masks[k] = self._around(scan.column_px[k], wrong[k])
+            self._others.setdefault(k, []).append(np.where(wrong[k], scan.column_px[k], np.nan))
         scan.give_up(wrong, Reason.AMBIGUOUS)
 
         def wanted() -> Iterator[Shot]:
@@ -132,34 +167,46 @@ class SecondLook:
                     yield shot
 
         def look(shot: Shot) -> Step:
-            mask = masks[places[shot.time, shot.bearing][0]]
+            k = places[shot.time, shot.bearing][0]
+            mask = np.any([self._around(column) for column in self._others[k]], axis=0)
             ridges = self._pipeline.ridges(shot)
             if ridges is not None:
-                mask |= still.mask(shot.bearing, ridges)
+                mask |= known.still.mask(shot.bearing, ridges)
             for looks_left in range(_LOOKS - 1, -1, -1):
                 step = self._pipeline.process(shot, mask)
-                with np.errstate(invalid="ignore"):
-                    false = _reflectance(step) < _DIM * usual
-                false |= still.line(shot.bearing, step.line.column_px, ridge_of(step.line.peak, step.line.width_px))
+                false = _other(step, k, known, ridges)
                 if looks_left == 0 or false.sum() < _LEAST_ROWS:
                     break
-                mask |= self._around(step.line.column_px, false)
+                mask |= self._around(np.where(false, step.line.column_px, np.nan))
             step.profile.reason[false] = Reason.AMBIGUOUS
             return step
 
         def take(step: Step) -> None:
             for k in places[step.shot.time, step.shot.bearing]:
-                scan.amend(k, ~scan.valid[k] & (step.profile.reason == Reason.OK), step.profile)
+                new = ~scan.valid[k] & (step.profile.reason == Reason.OK)
+                scan.amend(k, new, step.profile)
+                self._reflectance[k][new] = _reflectance(step)[new]
+                self._ridge[k][new] = ridge_of(step.line.peak, step.line.width_px)[new]
 
         run(wanted(), look, [take])
 
-    def _around(self, column: F32 | F64, rows: Mask) -> Mask:
-        """(ceil(H / BLOCK), W) that is True around the line's columns (H,) in some rows (H,)."""
-        mask = np.zeros((-(-len(rows) // BLOCK), self._pipeline.calibration.intrinsics.width), bool)
-        row = np.flatnonzero(rows)
+    def _around(self, column: F32 | F64) -> Mask:
+        """(ceil(H / BLOCK), W) that is True around columns (H,)."""
+        mask = np.zeros((-(-len(column) // BLOCK), self._pipeline.calibration.intrinsics.width), bool)
+        row = np.flatnonzero(np.isfinite(column))
         around = np.rint(column[row]).astype(np.intp)[:, None] + np.arange(-_AROUND_PX, _AROUND_PX + 1)
         mask[row[:, None] // BLOCK, np.clip(around, 0, mask.shape[1] - 1)] = True
         return mask
+
+
+def _other(step: Step, k: int, known: _Known, ridges: U8 | None) -> Mask:
+    """Rows (H,) of a step, of a scan's bearing `k`, that are another thing's than the line."""
+    line = step.line
+    ridge = ridge_of(line.peak, line.width_px)
+    other = known.still.line(step.shot.bearing, line.column_px, ridge, known.share(k, step.profile.range_m))
+    with np.errstate(invalid="ignore"):
+        other |= _reflectance(step) < _DIM * known.usual
+    return other if ridges is None else other | _hidden(line.column_px, ridge, ridges)
 
 
 def _reflectance(step: Step) -> F32:
@@ -167,6 +214,16 @@ def _reflectance(step: Step) -> F32:
     with np.errstate(invalid="ignore"):
         light = np.where(step.line.peak < _UNCLIPPED, step.line.peak * step.line.width_px, np.nan)
         return (light * step.profile.range_m**2).astype(np.float32)
+
+
+def _hidden(column: F64, ridge: F64, ridges: U8) -> Mask:
+    """Rows (H,) of a line that is nothing that stands out in its picture, of these `ridges`: edges of bright panes."""
+    row = np.flatnonzero(np.isfinite(column))
+    near = np.rint(column[row]).astype(np.intp)[:, None] + np.arange(-_WITHIN_PX, _WITHIN_PX + 1)
+    shown = ridges[row[:, None] // BLOCK, np.clip(near, 0, ridges.shape[1] - 1)].max(axis=1)
+    hidden = np.zeros(len(column), bool)
+    hidden[row] = shown < np.fmax(_SHOWN * ridge[row], _LEAST_SHOWN)
+    return hidden
 
 
 def _apart(bearings: F64, some: list[int]) -> list[int]:

@@ -39,6 +39,7 @@ _VIEWS, _FARTHEST = 12, float(np.radians(45.0))  # other pictures that are asked
 _LEAST_VIEWS = 3
 _NOISE = 2.0  # [grey levels] of ridges; the dimmest line that counts has more, for it must exceed its own noise sixfold
 SHARE = 0.6  # of the other pictures that must show what stands still
+_ROUNDING = 1e-3  # of sums of shares
 _PART = 0.5  # of its height that a thing has in every picture
 _TOGETHER = 2  # rows of ridges before and after one that are asked with it
 _RUN_PX = 16.0  # that a line runs from one to the next, at most
@@ -80,13 +81,13 @@ class StillThings:
         )
         self._views[bearing] = _View(fine, coarse)
 
-    def line(self, bearing: float, column: F32 | F64, ridge: F32 | F64, share: float = SHARE) -> Mask:
+    def line(self, bearing: float, column: F32 | F64, ridge: F32 | F64, share: float | F64 = SHARE) -> Mask:
         """Which rows (H,) of the line found in a picture taken at `bearing` [rad] show what stands still.
 
         Args:
             column: (H,) [px] NaN where none.
             ridge: (H,) as `laserline.ridge_of` has it [grey levels].
-            share: of the other pictures, which must agree.
+            share: of the other pictures, which must agree; one for all rows, or (H,).
         """
         row = np.arange(_FIRST, len(column), BLOCK)
         row = row[np.isfinite(column[row])]
@@ -100,11 +101,12 @@ class StillThings:
         least = np.maximum(least, _NOISE)
         broken = (np.diff(row, prepend=row[0]) > 2 * BLOCK) | (np.abs(np.diff(at, prepend=at[0])) > _RUN_PX)
         run = np.cumsum(broken, dtype=np.intp)
-        stands = self._standing(bearing, (row, at, least), run, share, coarse=True)
+        shares: F64 = np.broadcast_to(share, column.shape)[row]
+        stands = self._standing(bearing, (row, at, least), run, shares, coarse=True)
         # What stands may, and what is asked with it.
         doubtful = np.flatnonzero(np.convolve(stands, np.ones(2 * _TOGETHER + 1))[_TOGETHER:-_TOGETHER])
         some = row[doubtful], at[doubtful], least[doubtful]
-        stands[doubtful] = self._standing(bearing, some, run[doubtful], share, coarse=False)
+        stands[doubtful] = self._standing(bearing, some, run[doubtful], shares[doubtful], coarse=False)
         # What is true of a row is true of those around it on the same line.
         asked = np.full(-(-len(column) // BLOCK), -1)
         asked[row // BLOCK] = np.arange(len(row))
@@ -114,16 +116,16 @@ class StillThings:
         still |= (of >= 0) & near & stands[of]
         return still
 
-    def _standing(self, bearing: float, places: _Places, run: Index, share: float, *, coarse: bool) -> Mask:
+    def _standing(self, bearing: float, places: _Places, run: Index, share: F64, *, coarse: bool) -> Mask:
         """Which of the places (N,) stand still, asked together with those next to them in the same run (N,)."""
         index = np.arange(len(run))
         if not index.size:
             return np.zeros(0, bool)
         first = np.maximum(index - _TOGETHER, np.searchsorted(run, run))
         stop = np.minimum(index + _TOGETHER + 1, np.searchsorted(run, run, side="right"))
-        counts = self._agreement(bearing, places, coarse)
-        seen, agreed = (_between(values, first, stop) for values in counts)
-        return np.asarray(np.any((seen >= _LEAST_VIEWS * (stop - first)) & (agreed >= share * seen), axis=0))
+        seen, agreed = self._agreement(bearing, places, coarse)
+        enough = _between(agreed - share.astype(np.float32) * seen, first, stop) >= -_ROUNDING
+        return np.asarray(np.any((_between(seen, first, stop) >= _LEAST_VIEWS * (stop - first)) & enough, axis=0))
 
     def mask(self, bearing: float, ridges: U8) -> Mask:
         """Where a picture taken at `bearing` [rad], of these `ridges`, shows what stands still (ceil(H / BLOCK), W)."""

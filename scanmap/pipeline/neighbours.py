@@ -1,0 +1,64 @@
+"""What the bearings on either side say of a picture's points: surfaces go on from one bearing to the next.
+
+The line moves with the head and stays about where it is in the picture; what stands still runs through the picture by
+as much as the head turns. Taken for the line it is a point that neither neighbour knows anything of. So is a thin rod,
+or the first bearing behind a depth edge: neighbours alone prove nothing. They say how much other proof is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.pipeline.still import SHARE
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+_FARTHEST = float(np.radians(20.0))  # what lies farther round is no neighbour
+_SAME = float(np.radians(0.02))  # bearings closer than this are one
+_STEEP, _SLACK_M = 3.0, 0.02  # tangent of the incidence up to which a surface goes on, and what noise adds
+# Share of the other pictures that must show what stands still: where neighbours on one side go on and on the other do
+# not, and where none does. In 23 hard rooms 0.003 of 104,000 true points of the first kind, none of 7,800 of the second
+# were met by as much, and 0.6 and 0.9 of the false ones.
+_ONE_SIDE, _NEITHER = 0.4, 0.3
+
+
+class Neighbours(NamedTuple):
+    """The range image at one moment, and who is next to whom."""
+
+    range_m: F32  # (B, H) NaN where there is no point
+    beside: Sequence[Sequence[tuple[int, float]]]  # (B,) those next to each, and how far the head turns to them [rad]
+
+    def share(self, k: int, range_m: F32 | F64) -> F64:
+        """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""
+        goes_on, denied = np.zeros(len(range_m), np.intp), np.zeros(len(range_m), np.intp)
+        for other, turn in self.beside[k]:
+            theirs = self.range_m[other]
+            with np.errstate(invalid="ignore"):
+                near = np.abs(range_m - theirs) <= _STEEP * turn * np.minimum(range_m, theirs) + _SLACK_M
+            goes_on += near
+            denied += np.isfinite(theirs) & ~near
+        return np.where(denied == 0, SHARE, np.where(goes_on > 0, _ONE_SIDE, _NEITHER))
+
+
+def neighbours_of(bearings: F64, range_m: F32, asked: Collection[int]) -> Neighbours:
+    """Of bearings (B,) [rad] with ranges (B, H) [m]; those not `asked`, by their index, are nobody's."""
+    turn = 2.0 * np.pi
+    order = sorted(asked, key=lambda k: (bearings[k] % turn, bearings[k]))
+    at = np.array([bearings[k] % turn for k in order])
+    beside: list[list[tuple[int, float]]] = [[] for _ in bearings]
+    for i, k in enumerate(order):
+        for way in (-1, 1):
+            for step in range(1, len(order)):
+                j = (i + way * step) % len(order)
+                away = float((way * (at[j] - at[i])) % turn)
+                if away > turn - _SAME or away < _SAME:
+                    continue
+                if away <= _FARTHEST:
+                    beside[k].append((order[j], away))
+                break
+    return Neighbours(range_m.copy(), beside)
