@@ -73,8 +73,11 @@ def with_error_bars(line: LaserLine, sight: Sight, rows: int, doubts: Doubts) ->
 def _hidden(sight: Sight, width: F64, peak: F64, leans: F64) -> F64:
     """What rounding does to lines of some widths and heights (P, H) that the scatter along them does not show [px]."""
     hidden = np.zeros(width.shape)
-    for k, (rounding, mixture, noise) in enumerate(zip(sight.roundings, sight.mixtures, sight.noise, strict=True)):
+    alike = list(zip(sight.roundings, sight.mixtures, np.round(sight.noise, 1).tolist(), strict=True))
+    for one in set(alike):
+        rounding, mixture, noise = one
         if rounding is not None:
-            shared = shared_px(rounding, mixture, float(noise), width[k], peak[k])
-            hidden[k] = hidden_px(rounding, shared, leans[k])
+            some = [k for k, other in enumerate(alike) if other == one]
+            shared = shared_px(rounding, mixture, noise, width[some], peak[some])
+            hidden[some] = hidden_px(rounding, shared, leans[some])
     return hidden
