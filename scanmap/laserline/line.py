@@ -21,7 +21,7 @@ from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
 from scanmap.laserline.offframe import borne_out, standing_out
 from scanmap.laserline.offmatch import in_place
-from scanmap.laserline.onward import goes_on
+from scanmap.laserline.onward import gaps_in, goes_on
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, fit_gaussian, judged
@@ -207,9 +207,12 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
     if sight.off is None and params.method == "gauss":
         line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane, height), Reason.WIDE)
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px, height), Reason.EDGE)
-    for k, (picture, one) in enumerate(zip(sight.pictures(), _each(line, height), strict=True)):
+    free = np.isfinite(window[:, 0]) & (line.reason != Reason.EDGE)
+    gaps = gaps_in(line.column_px, free, height)
+    for k, (picture, one) in enumerate(zip(sight.pictures(), _each(line, height), strict=True) if gaps.any() else ()):
         own = slice(k * height, (k + 1) * height)
-        _go_on(one, doubts.of(own), picture, params, window[own], still)
+        if gaps[k]:
+            _go_on(one, doubts.of(own), picture, params, (window[own], free[own]), still)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
@@ -279,10 +282,15 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
 
 
 def _go_on(
-    line: LaserLine, doubts: Doubts, sight: Sight, params: LaserLineParams, window: Array, still: Mask | None
+    line: LaserLine,
+    doubts: Doubts,
+    sight: Sight,
+    params: LaserLineParams,
+    where: tuple[Array, Mask],
+    still: Mask | None,
 ) -> None:
     """Rows into which a run of a picture's line goes on, in place: what a row leaves open its neighbours tell."""
-    free = np.isfinite(window[:, 0]) & (line.reason != Reason.EDGE)
+    window, free = where
     for _ in range(_ROUNDS):
         row, column = goes_on(line, sight.lit, float(sight.noise[0]), free, still)
         if not row.size:

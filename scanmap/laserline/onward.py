@@ -43,6 +43,13 @@ class _Ends(NamedTuple):
         return self.row[end] + away, np.rint(self.column[end] + self.slope[end] * away).astype(np.intp)
 
 
+def gaps_in(column: F64, free: Mask, height: int) -> Mask:
+    """Pictures (P,) of `height` rows with gaps in their lines (P H,) in which rows may have a point (P H,)."""
+    missing = (np.isnan(column) & free).reshape(-1, height)
+    wide = [missing[:, k : height - _FEW + 1 + k] for k in range(_FEW)]
+    return np.asarray(np.logical_and.reduce(wide).any(axis=1))
+
+
 def goes_on(line: LaserLine, plane: U8, noise: float, free: Mask, still: Mask | None = None) -> tuple[Index, Index]:
     """Rows (N,) without a point in which a run of the line goes on straight, and the integer columns (N,) there.
 

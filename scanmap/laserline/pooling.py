@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.pictures import by_picture, not_one
+from scanmap.laserline.pictures import not_one
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -114,19 +114,18 @@ def _fourth_differences(
 ) -> list[list[tuple[Index, Array]]]:
     """For each picture and lag: middle rows of every other fourth difference, its square over what sigmas expect."""
     pictures, height = column.shape
-    column, variance = column.ravel(), np.square(sigma).ravel()
+    variance, start = np.square(sigma), start.reshape(column.shape)
     told: list[list[tuple[Index, Array]]] = [[] for _ in range(pictures)]
     for lag in lags:
-        span = 4 * lag
-        rows = max(len(column) - span, 0)
-        at = ((start[:rows] == start[len(start) - rows :]) & np.isfinite(column[:rows])).nonzero()[0]
-        a, b, c, d, e = (column[k : k + rows] for k in range(0, span + 1, lag))
-        va, vb, vc, vd, ve = (variance[k : k + rows] for k in range(0, span + 1, lag))
+        rows = max(height - 4 * lag, 0)
+        a, b, c, d, e = (column[:, k * lag : k * lag + rows : 2] for k in range(5))
+        va, vb, vc, vd, ve = (variance[:, k * lag : k * lag + rows : 2] for k in range(5))
         step = a + e - 4.0 * (b + d) + 6.0 * c
         ratio = step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc)
-        for k, own in enumerate(by_picture(at // height, pictures)):
-            some = at[own][::2]
-            told[k].append((some + (2 * lag - k * height), ratio[some]))
+        one = (start[:, :rows:2] == start[:, 4 * lag : 4 * lag + rows : 2]) & np.isfinite(a)
+        for k in range(pictures):
+            some = one[k].nonzero()[0]
+            told[k].append((2 * (some + lag), ratio[k, some]))
     return told
 
 
