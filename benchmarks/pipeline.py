@@ -145,7 +145,8 @@ def main() -> None:
         decoding = {
             name: spent(partial(decode_all, decode, jpegs, options.frames)) for name, decode in decoders.items()
         }
-        scan, second_look = Scan(head.mount, HEIGHT), SecondLook(pipeline)
+        scan = Scan(head.mount, HEIGHT, capacity=options.frames)
+        second_look = SecondLook(pipeline)
         worker_mb = []
 
         def replay() -> None:

@@ -59,8 +59,9 @@ _KEEP_MEMORY = {
 # The workers are the parallelism; threads that BLAS starts as it is imported cost a fifth of a worker's start.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 # The worker imports scanmap from where this process did.
+# Importing makes no garbage.
 _START = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "import gc; gc.disable(); import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
     "from scanmap.pipeline.processes import serve; serve(sys.stdin.buffer, sys.stdout.buffer)"
 )
 
@@ -222,6 +223,7 @@ def serve(messages: IO[bytes], answers: IO[bytes]) -> None:
     cv2.setNumThreads(1)  # the workers are the parallelism
     pipeline = cast(Pipeline, pickle.load(messages))
     gc.freeze()  # what was imported is never garbage
+    gc.enable()
     while True:
         try:
             pipeline.laser, shots = cast(tuple[Laser | None, list[Shot]], pickle.load(messages))

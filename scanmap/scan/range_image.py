@@ -43,7 +43,10 @@ class Scan:
     of the filled part: points in the world frame [m], NaN where a cell has no point.
     """
 
-    def __init__(self, mount: HeadMount, rows: int, comments: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, mount: HeadMount, rows: int, comments: Mapping[str, Any] | None = None, capacity: int = 0
+    ) -> None:
+        """An empty scan, with room for `capacity` bearings; for more it grows."""
         self.mount = mount
         self.rows = rows
         # What files say about this scan: `source: digital twin`, software version, rig.
@@ -58,12 +61,13 @@ class Scan:
             "column_px": np.empty((0, rows), np.float32),
             "reason": np.empty((0, rows), np.uint8),
         }
+        if capacity:
+            self._grow(capacity)
 
     @classmethod
     def empty(cls, mount: HeadMount, rows: int, bearings: F64, comments: Mapping[str, Any] | None = None) -> Scan:
         """A scan of B `bearings` [rad] without a point: every cell NaN and `Reason.NOT_SCANNED`, to be filled."""
-        scan = cls(mount, rows, comments)
-        scan._grow(len(bearings))
+        scan = cls(mount, rows, comments, len(bearings))
         scan._count = len(bearings)
         scan._bearings[:] = bearings
         for name, values in scan._fields.items():

@@ -34,6 +34,7 @@ from scanmap.view import View
 from scanmap.view.viewer import has_display
 
 # While a scan runs the viewer's map is made anew this often [shots].
+MOST_EXPECTED = 4096  # bearings that room is made for beforehand, whatever a recording says it holds
 MAP_EVERY = 20
 
 
@@ -114,7 +115,8 @@ class Job:
         Raises:
             Exception: the very first shot failed, so there is nothing to keep; a ScanmapError where foreseen.
         """
-        scan = Scan(self.calibration.mount, self.calibration.intrinsics.height, self.comments)
+        expected = min(self.total or 0, MOST_EXPECTED)
+        scan = Scan(self.calibration.mount, self.calibration.intrinsics.height, self.comments, expected)
         ended = "finished"
         error: Exception | None = None
         try:
