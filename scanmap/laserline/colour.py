@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, COLOURLESS, Candidates, is_large, unit_of
 from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
+from scanmap.laserline.result import LaserLine
 from scanmap.laserline.runs import numbered
 from scanmap.laserline.shares import HALF, across, flank_lead, light_added
 
@@ -24,6 +25,9 @@ _COLOURLESS_SHARE = 0.85  # a line that stands out in other channels this much h
 # A run is not the laser line from this share of its height in another channel on.
 _STRANGER = 0.62
 _UNTOLD = 0.5  # what a saturated candidate's score is worth beside one that shows the laser's colour
+# Lead over another channel, in heights of a beam like it and in grey levels, that only what takes light can have; part
+# of such a beam's height, for each pixel of its width, that a mean of five columns has.
+_TAKES, _CORE_LIGHT = (1.5, 4.0), 0.45
 _MOSTLY = 0.75  # share of a run's rows
 _PURE = 0.45  # height in other channels of a line whose flanks must show its colour
 # A place's share may exceed the laser's by so much, and even where that makes it nearly white by the less.
@@ -146,20 +150,23 @@ def _of_laser(seen: _Colours, laser: float | None, noise: float) -> F32:
     return np.asarray(np.where(seen.saturated, np.maximum(factor, pure), factor), np.float32)
 
 
-def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, rows: int) -> tuple[Mask, Mask]:
-    """Rows (P H,) in runs that stand out in another channel nearly as much as in the laser's own; and those sure to.
+def strangers(line: LaserLine, image: U8, channel: int, pure: Mask, rows: int) -> tuple[Mask, Mask]:
+    """Rows (P H,) in runs of another colour than the laser's; and those sure to be.
 
     Args:
-        column: (P H,) of the lines of P pictures below each other, NaN where none.
+        line: (P H,) of P pictures below each other.
         image: (P H, W, 3).
         channel: the laser's own.
         pure: (P H,) rows known to be of its colour; a run of mostly such is not asked.
         rows: of a picture, H.
 
-    Over a whole run the shares of the channels are known far better than in a row; of a run that is in doubt the
-    parts are asked. Where the core saturates they say nothing, but what is beside it must not be white; where that is
-    bright itself, as a white board is, it hardly can be anything else, and the core must not be white.
+    What stands out in another channel nearly as much as in the laser's own is of another colour; and so is what leads
+    another channel by far more than it rises itself, for a laser takes no light. Over a whole run the shares of the
+    channels are known far better than in a row; of a run that is in doubt the parts are asked. Where the core saturates
+    they say nothing, but what is beside it must not be white; where that is bright itself, as a white board is, it
+    hardly can be anything else, and the core must not be white.
     """
+    column = line.column_px
     lost = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
     if not row.size or image.shape[1] <= 2 * HALF:
@@ -174,14 +181,16 @@ def strangers(column: NDArray[np.float64], image: U8, channel: int, pure: Mask, 
     height = light_added(y.astype(np.float32), channel)
     clipped = y[HALF, channel] >= COLOURLESS
     count = np.bincount(run)
-    by_run = np.array([np.bincount(run, values) for values in (*height, clipped)])
+    whole = line.peak[row] * np.minimum(_CORE_LIGHT * line.width_px[row], 1.0)
+    values = (*height, clipped, whole)
+    by_run = np.array([np.bincount(run, value) for value in values])
     coloured, bright = _core_of(y, channel, run)
     lost[row] = _white_beside(image, row, middle, channel, clipped, run) & ~(coloured & bright)[run]
     stranger = _in_other_channels(by_run, count, channel)[run]
     if stranger.any():
         # Sums over the rows nearby as differences of sums from the start.
-        total = np.zeros((4, len(row) + 1))
-        np.cumsum([*height, clipped], axis=1, out=total[:, 1:])
+        total = np.zeros((len(values), len(row) + 1))
+        np.cumsum(values, axis=1, out=total[:, 1:])
         index = np.arange(len(row))
         first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
         stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
@@ -228,9 +237,15 @@ def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: M
 
 
 def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) -> Mask:
-    """Whether parts stand out in another channel; `total` (4, N): heights by channel, clipped rows; of `rows` (N,)."""
-    other = np.maximum(total[:3][channel - 1], total[:3][channel - 2])
-    in_other: Mask = (other > _STRANGER * total[channel]) & (total[3] < _CLIPPED * rows)
+    """Whether parts stand out in another channel, or take light there.
+
+    Args:
+        total: (5, N) sums of heights by channel, of clipped rows, of heights that beams would have.
+        rows: (N,) of the parts.
+    """
+    own, others = total[channel], total[:3][[channel - 1, channel - 2]]
+    takes = own - others.min(axis=0) > _TAKES[0] * np.maximum(own, total[4]) + _TAKES[1] * rows
+    in_other: Mask = ((others.max(axis=0) > _STRANGER * own) | takes) & (total[3] < _CLIPPED * rows)
     return in_other
 
 

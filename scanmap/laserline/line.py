@@ -203,7 +203,7 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
         take_cores(line, at, y.T, widest, around.rows, params)
     if sight.image is not None:
         pure = np.repeat(course.pure, BLOCK, axis=1)[:, :height].ravel()
-        line = without(line, strangers(line.column_px, sight.image, sight.channel, pure, height)[0], Reason.AMBIGUOUS)
+        line = without(line, strangers(line, sight.image, sight.channel, pure, height)[0], Reason.AMBIGUOUS)
     if sight.off is None and params.method == "gauss":
         line = without(line, flat_tops(line.column_px, line.width_px, line.peak, sight.plane, height), Reason.WIDE)
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px, height), Reason.EDGE)
@@ -302,7 +302,7 @@ def _go_on(
         more = without(_within(more, window), ~on_track, Reason.WEAK)
         if sight.image is not None:
             none = np.zeros(len(free), bool)
-            more = without(more, strangers(more.column_px, sight.image, sight.channel, none, len(free))[1], Reason.WEAK)
+            more = without(more, strangers(more, sight.image, sight.channel, none, len(free))[1], Reason.WEAK)
         found = np.isfinite(more.column_px)
         if not found.any():
             return

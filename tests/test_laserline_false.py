@@ -1,0 +1,56 @@
+"""What is no line in one picture without a laser-off frame: paint that leads by its colour; and what looks like it."""
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_lines import HARD, Room, hard_frame, line_light, score, sensor
+
+from scanmap.laserline import LaserLineParams, Reason, find_laser_line
+
+GAUSS = LaserLineParams()
+
+
+def test_a_room_full_of_posters_and_no_line():
+    frames = [hard_frame("empty posters", seed) for seed in range(16)]
+    false = [score(find_laser_line(frame.image, GAUSS).column_px, frame).false for frame in frames]
+    assert np.mean(false) <= 0.006
+    assert max(false) <= 0.08
+
+
+def strip(beside, core, seed=0):
+    """A strip of paint 4 px wide, `core` (BGR), between a wall and another thing."""
+    light = np.full((300, 400, 3), (60.0, 60.0, 60.0), np.float32)
+    light[:, 200:] = beside
+    light[:, 200:204] = core
+    return sensor(cv2.GaussianBlur(light, (0, 0), 0.7), 1.5, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(("beside", "core"), [((110, 30, 60), (30, 95, 65)), ((60, 60, 60), (20, 95, 65))])
+def test_what_takes_another_colours_light_is_paint(beside, core):
+    line = find_laser_line(strip(beside, core), GAUSS)
+    assert np.isnan(line.column_px).all()
+    assert (line.reason == Reason.AMBIGUOUS).mean() > 0.9
+
+
+@pytest.mark.parametrize("dark", [0.0, 25.0])
+def test_a_line_on_a_pole_darker_than_the_room_is_one(dark):
+    """A pole takes light of every colour alike, which is not the line's doing."""
+    light = np.full((300, 400, 3), 70.0, np.float32)
+    light[:, 195:206] -= dark
+    light += line_light(np.full(300, 200.3), 60.0, 1.2, 400)[..., None] * np.float32((0.1, 1.0, 0.1))
+    line = find_laser_line(sensor(light, 1.5, np.random.default_rng(1)), GAUSS)
+    assert np.mean(np.abs(line.column_px - 200.3) < 0.5) >= 0.99
+
+
+# A camera's colour matrix may take from one channel what it gives another.
+@pytest.mark.parametrize("laser", [(-0.2, -0.15, 1.0), (-0.15, 1.0, -0.25)])
+@pytest.mark.parametrize("name", ["thin line", "posters"])
+def test_a_laser_whose_colour_is_less_than_pure_nothing(laser, name):
+    room = Room(600, 800, np.random.default_rng(7))
+    HARD[name](room)
+    room.laser = laser
+    frame = room.frame(True)
+    picture = np.asarray(cv2.imdecode(cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1], 1))
+    found, false = score(find_laser_line(picture, GAUSS).column_px, frame)
+    assert found >= 0.99
+    assert false <= 0.002
