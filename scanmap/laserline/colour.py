@@ -37,7 +37,7 @@ _BLEEDS, _WHITISH = (0.4, 0.05), 0.8
 _NEAR, _LEAD = (0.07, 0.11), (0.1, 0.3)
 # From which share of its rows on a run's core is saturated. What then lags behind the laser's channel by the second
 # [grey levels], not cut, is not white; nor is, of other runs, what has less than the third in other channels.
-_CLIPPED, _COLOURED, _SURELY = 0.3, 10.0, 0.9
+_CLIPPED, _COLOURED, _SURELY = 0.3, 10.0, 0.95
 _BRIGHT = 170.0  # [grey levels] beside a core
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
@@ -196,7 +196,9 @@ def strangers(line: LaserLine, image: U8, channel: int, pure: Mask, rows: int) -
         stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
         stranger &= _in_other_channels(total[:, stop] - total[:, first], stop - first, channel)
         lost[row[stranger]] = True
-    sure, share = lost.copy(), np.maximum(by_run[channel - 1], by_run[channel - 2]) / np.maximum(by_run[channel], 1.0)
+    heights = by_run[:3]
+    share = np.maximum(heights[channel - 1], heights[channel - 2]) / np.maximum(heights[channel], 1.0)
+    sure = lost.copy()
     sure[row[np.where(by_run[3] > _CLIPPED * count, coloured, share < _SURELY)[run]]] = False
     return lost, sure
 
