@@ -130,7 +130,8 @@ def stand_out(plane: U8, row: Index, column: F32, noise: F64) -> tuple[Index, F3
     # Noise moves the maximum of a dim line; the path is worth something too.
     away = np.square(np.arange(-reach, reach + 1))[:, None] * (2 * core * _PATH_WORTH * noise)
     away = np.minimum(away, 1000.0).astype(np.int16)
-    rank = 2 * inner - side - (away if len(noise) == 1 else away[:, row // (len(plane) // len(noise))])
+    rank = 2 * inner - side
+    rank -= away if len(noise) == 1 else away.take(row // (len(plane) // len(noise)), axis=1)
     # The place is packed below the rank, so that one maximum gives both: ten times the speed of argmax.
     packed = rank.astype(np.int32) * 16 + np.arange(2 * reach, -1, -1, dtype=np.int32)[:, None]
     at = 2 * reach - (packed.max(axis=0) & 15)

@@ -165,7 +165,7 @@ def _peaks(
     sigma *= np.float32(1.0) + np.float32(_CURVED) * np.square(np.minimum(sigma / fit.s, np.float32(0.4)))
     if dim is not None:
         sigma[dim.rows] = own[dim.rows] / dim.height
-    slope = look.slope
+    slope = look.bell * look.z  # derivative by u, times s / A
     slope *= look.weight
     odd = np.square(look.z)
     odd -= np.float32(1.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -201,18 +202,13 @@ def _risk(significance: Array, at: Index, shape: tuple[int, ...]) -> Array:
     (1981) of the risk of x^3 / (x^2 + 2), which single rows scatter too much to give.
     """
     doubtful = significance + _BEND_DOUBT
-    own = 1.0 + (6.0 * _BEND_DOUBT * significance / doubtful - 2.0 * _BEND_DOUBT) / doubtful
-    height = shape[-1]
-    # Sums over the rows of a picture before each, and how many those are; a picture has one more than rows.
-    sums = np.zeros((2, int(np.prod(shape[:-1])), height + 1))
-    flat = sums.reshape(2, -1)
-    first = at + at // height
-    row = at % height
-    flat[0, first + 1], flat[1, first + 1] = own, 1.0
-    np.cumsum(sums, axis=2, out=sums)
-    low, high = np.minimum(row, _BEND_ROWS // 2), np.minimum(height - row, _BEND_ROWS // 2 + 1)
-    total, count = flat[:, first + high] - flat[:, first - low]
-    risk: Array = np.maximum(total / count, _BEND_LEAST)
+    rows = np.zeros((2, int(np.prod(shape[:-1])), shape[-1]))
+    rows[0].ravel()[at] = 1.0 + (6.0 * _BEND_DOUBT * significance / doubtful - 2.0 * _BEND_DOUBT) / doubtful
+    rows[1].ravel()[at] = 1.0
+    total, count = (
+        cv2.boxFilter(values, -1, (_BEND_ROWS, 1), normalize=False, borderType=cv2.BORDER_CONSTANT) for values in rows
+    )
+    risk: Array = np.maximum(np.asarray(total).ravel()[at] / np.asarray(count).ravel()[at], _BEND_LEAST)
     return risk
 
 

@@ -71,12 +71,12 @@ class Leftover:
         self.bell = np.square(self.z)
         self.bell *= np.float32(-0.5)
         np.exp(self.bell, out=self.bell)
-        self.slope = self.bell * self.z  # derivative by u, times s / A
         self.residual = self.bell * -fit.A
         self.residual += y
         self.residual -= fit.b
         reach = np.maximum(np.float32(REACH), np.float32(3.0) / fit.s) + np.float32(0.5) / fit.s
-        self.weight = (np.abs(self.z) <= reach).astype(np.float32)
+        # Farther away the bell is lower.
+        self.weight = (self.bell >= np.exp(np.float32(-0.5) * np.square(reach))).astype(np.float32)
 
 
 def first_guess(y: F32, x: F32, b: F32, top: F32) -> Fit:
@@ -105,9 +105,11 @@ def _improve_whole(x: F32, look: Leftover, fit: Fit) -> Fit:
     """
     wr = look.weight * look.residual
     per_s = np.float32(1.0) / fit.s
-    level, bell, slope = wr.sum(axis=0) * per_s, dot(wr, look.bell) * per_s, dot(wr, look.slope) * per_s
-    wr *= look.slope
-    bent = dot(wr, look.z) * per_s
+    level = wr.sum(axis=0) * per_s
+    wr *= look.bell
+    bell = wr.sum(axis=0) * per_s
+    wr *= look.z
+    slope, bent = wr.sum(axis=0) * per_s, dot(wr, look.z) * per_s
     count = look.weight.sum(axis=0) * per_s
     # The level eliminated, then height and width; all per sigma.
     k = np.float32(2.0 * np.pi) / count
