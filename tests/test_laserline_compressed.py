@@ -145,3 +145,16 @@ def test_little_is_left_of_what_all_rows_of_an_upright_line_share(quality: int, 
         assert np.isfinite(off).mean() > 0.99
         shared.append(np.nanmean(off))
     assert np.sqrt(np.mean(np.square(shared))) < limit
+
+
+def test_a_slope_of_the_rooms_light_does_not_move_a_cut_core() -> None:
+    """It is three widths squared of the slope over the line's height, and in brightness the line is half as high."""
+    off = []
+    for seed, slope in enumerate((-0.5, -0.3, 0.3, 0.5)):
+        rng, column = np.random.default_rng(seed), np.full(320, 150.0 + 0.29 * seed)
+        x = np.arange(300.0) - column[:, None]
+        light = (2.5 * np.exp(-0.5 * (x / 2.4) ** 2))[..., None] * np.array(RED)
+        light = 255.0 * light + (70.0 + slope * x)[..., None] + 1.5 * rng.standard_normal((320, 300, 3))
+        picture = compressed(np.clip(np.rint(light), 0, 255).astype(np.uint8), 92)
+        off.append(np.nanmean(find_laser_line(picture, POOLED).column_px - column) * np.sign(slope))
+    assert abs(np.mean(off)) < 0.015

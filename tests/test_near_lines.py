@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from scanmap.laserline import LaserLineParams, find_laser_line
+from scanmap.laserline.channel import judged_channel
 
 GAUSS = LaserLineParams()
 
@@ -65,3 +66,14 @@ def test_a_red_bar_in_a_colour_jpeg_is_not_taken_for_its_blue_core(u, sigma, pea
     assert np.isfinite(off).mean() >= 0.95
     assert np.sqrt(np.nanmean(off**2)) < 0.3
     assert abs(np.nanmean(off)) < 0.02
+
+
+@pytest.mark.parametrize(
+    "light", [(1.0, 1.0, 1.0), (0.97, 0.98, 1.0), (0.6, 0.8, 1.0)], ids=["white", "nearly", "warm"]
+)
+def test_a_cut_core_is_cut_in_coloured_light_too(light):
+    """Where the room's light is taken for grey, what was cut is no longer 255; only in green is it narrow there."""
+    x = np.arange(800.0) - 400.0
+    image = 70.0 * np.array(light) + (5.0 * 255.0 * np.exp(-0.5 * (x / 2.4) ** 2))[:, None] * np.array((0.06, 0.1, 1.0))
+    image = image + 1.5 * np.random.default_rng(0).standard_normal((320, 800, 3))
+    assert judged_channel(np.clip(np.rint(image), 0, 255).astype(np.uint8)) == (2, True)

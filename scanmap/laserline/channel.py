@@ -48,11 +48,12 @@ def judged_channel(image: U8, background: U8 | None = None) -> tuple[int, bool]:
         n = len(below)
         both_rows = np.concatenate([above[:n], below])
         planes = _planes(both_rows if background is not None else _neutral(both_rows))
+        cut = _planes(np.asarray(cv2.threshold(both_rows, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8))
         rows = [plane[:n] for plane in planes]
         blazing = _blazing_channel(rows)
         if blazing is not None:
             return blazing, True
-        upper, lower = _by_colour(planes).reshape(3, 2, n, -1).swapaxes(0, 1).reshape(2, 3 * n, -1)
+        upper, lower = _by_colour(planes, cut).reshape(3, 2, n, -1).swapaxes(0, 1).reshape(2, 3 * n, -1)
         both = np.asarray(cv2.min(upper, cv2.dilate(lower, np.ones((1, 5), np.uint8))), np.uint8)
         best = np.sort(both.max(axis=1).reshape(3, n), axis=1)
         strength = [rare * float(rising[n // 2 :].mean()) for rare, rising in zip(_USUAL, best, strict=True)]
@@ -113,17 +114,21 @@ def _planes(rows: U8) -> list[U8]:
     return [np.asarray(plane, np.uint8) for plane in cv2.split(np.ascontiguousarray(rows))]
 
 
-def _by_colour(planes: Sequence[U8]) -> U8:
-    """How far each place (n, W) rises in a channel and in its leads over the others; the channels below each other."""
+def _by_colour(planes: Sequence[U8], cut: Sequence[U8]) -> U8:
+    """How far each place (n, W) rises in a channel and in its leads over the others; the channels below each other.
+
+    Args:
+        planes: (n, W) each.
+        cut: (n, W) each, 255 where the picture was saturated.
+    """
     # The channels below each other: a third of the calls.
     own, after, before = (np.concatenate([planes[(c + k) % 3] for c in range(3)]) for k in range(3))
-    brightest = cv2.max(cv2.max(own, after), before)
-    white = np.asarray(cv2.threshold(brightest, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    white = np.tile(np.asarray(cv2.max(cv2.max(cut[0], cut[1]), cut[2]), np.uint8), (3, 1))
     # The leads are halved to fit eight bits.
     leads = [np.asarray(cv2.addWeighted(own, 0.5, other, -0.5, 128.0), np.uint8) for other in (after, before)]
     width = own.shape[1]
     rise = _least(own, leads, white, max(_NARROW_PX[0], width // _NARROW_PX[1]), 5)
-    clipped = np.asarray(cv2.threshold(own, SATURATED - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    clipped = np.concatenate(cut)
     if np.asarray(cv2.erode(clipped, np.ones((1, 3), np.uint8))).any():
         # A saturated core of some width may be wider than that.
         away = max(_BRIGHT_PX[0], width // _BRIGHT_PX[1])

@@ -72,6 +72,7 @@ def fit_gaussian(
     contrast: F64,
     samples: Callable[[int], tuple[F32, F32]] | None = None,
     limit: F32 | None = None,
+    start: Fit | None = None,
 ) -> Peaks:
     """Fit b + A exp(-(x - u)^2 / 2 s^2) to each row's window.
 
@@ -82,6 +83,7 @@ def fit_gaussian(
         contrast: (P,) of the speckle; NaN: judged from the residuals.
         samples: gives y and usable for another half width of the window.
         limit: (N,) grey levels at which the lines are cut, infinite where they are whole; None: all of them are.
+        start: where the lines nearly are, if that is known.
 
     Gauss-Newton on four parameters, saturated samples left out: the maximum-likelihood estimate for additive
     Gaussian noise, whose bound for u is 2 s_n^2 s / (sqrt(pi) A^2) (Cramer-Rao; Hagen and others 2007). Under
@@ -94,7 +96,8 @@ def fit_gaussian(
     clipped = np.zeros(y.shape[1], bool)
     clipped[cut] = ~usable[n // 2 - 1 : n // 2 + 2, cut].all(axis=0)
     y, low, high = levelled(y, x, noise)
-    start = first_guess(y, x, low, high)
+    steps = 2 * ITERATIONS if start is None else ITERATIONS
+    start = first_guess(y, x, low, high) if start is None else start
     fit = fit_whole(y, x, start, cut)
     odd = (np.abs(fit.u) > _OFF_MOST) | (fit.s < _NARROW_PX) | (fit.s > n / _WIDEST) | (_DIM * noise > fit.A)
     odd[cut] = True
@@ -103,7 +106,7 @@ def fit_gaussian(
         # What is left of a clipped line needs more of its background to be told four parameters from.
         least = np.where(clipped[part], np.float32(6.0), np.float32(3.0))
         taken = y.take(part, axis=1), x, usable.take(part, axis=1), start.of(part)
-        fit = fit.with_rows(part, fit_part(*taken, least, limit[part]))
+        fit = fit.with_rows(part, fit_part(*taken, least, limit[part], steps))
     dim = dim_rows(y, x, cut, fit.s, fit.A, rows)
     if dim is not None:
         fit = fit.with_rows(dim.rows, Fit(dim.u, dim.s, dim.A, dim.b, dim.s * np.float32(0.5 * ROOT_PI)))

@@ -59,8 +59,8 @@ class Samples(NamedTuple):
         cut = (usable[middle - 1 : middle + 2].min(axis=0) < 1) & (self.lit is self.seen)
         return np.where(cut, np.float32(SATURATED), np.float32(np.inf))
 
-    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32, F32]:
-        """The same in what JPEG stores as brightness, and where (n,) the laser's channel is cut in it.
+    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32, F32, F32]:
+        """The same in what JPEG stores as brightness, where (n,) the laser's channel is cut in it, and its share (n,).
 
         Only where `beside` is known.
 
@@ -79,13 +79,12 @@ class Samples(NamedTuple):
         brightness += beside * (np.float32(1.0) - share)
         # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut.
         own, beside = own.astype(np.float32), beside.astype(np.float32)
-        low, low_beside = np.minimum(*ends(own)), np.minimum(*ends(beside))
+        low, low_beside = (np.float32(0.5) * np.add(*ends(channel)) for channel in (own, beside))
         flank = own < SATURATED
-        seen = (flank * (beside - low_beside)).sum(axis=0) / np.maximum(
-            (flank * (own - low)).sum(axis=0), np.float32(1.0)
-        )
+        light = np.maximum((flank * (own - low)).sum(axis=0), np.float32(1.0))
+        seen = (flank * (beside - low_beside)).sum(axis=0) / light
         cut = share * SATURATED + (np.float32(1.0) - share) * (low_beside + seen * (SATURATED - low))
-        return brightness, usable.astype(np.float32), cut
+        return brightness, usable.astype(np.float32), cut, share + (np.float32(1.0) - share) * seen
 
 
 def _some(values: NDArray[Any], some: Index | slice) -> NDArray[Any]:
@@ -165,10 +164,20 @@ def levelled(y: F32, x: F32, noise: F32) -> tuple[F32, F32, F32]:
     least = np.float32(4.5 * np.sqrt(2.0 / _end(y))) * noise
     steep = not_one((np.abs(ramp) >= np.maximum(least, np.float32(0.3) * height)).nonzero()[0])
     if steep.size:
-        even = y.take(steep, axis=1) - ramp[steep] * (x / np.float32(len(x) - _end(y)))
+        even = without_ramp(y.take(steep, axis=1), x, ramp[steep])
         y[:, steep] = even
         low[steep], top[steep] = np.minimum(*ends(even)), even.max(axis=0)
     return y, low, top
+
+
+def without_ramp(y: F32, x: F32, ramp: F32) -> F32:
+    """Windows (n, N) without the ramp that rises by so much (N,) from the middle of one end to that of the other."""
+    return y - ramp * (x / span_of(y))
+
+
+def span_of(y: F32) -> np.float32:
+    """Columns from the middle of one end of windows (n, N) to that of the other [px]."""
+    return np.float32(len(y) - _end(y))
 
 
 def _end(y: F32) -> int:

@@ -129,10 +129,10 @@ def _improve_whole(x: F32, look: Leftover, fit: Fit) -> Fit:
     return Fit(u, s, A, b, s * np.float32(0.5 * ROOT_PI))
 
 
-def fit_part(y: F32, x: F32, usable: F32, fit: Fit, least: F32, limit: F32) -> Fit:
+def fit_part(y: F32, x: F32, usable: F32, fit: Fit, least: F32, limit: F32, steps: int = 2 * ITERATIONS) -> Fit:
     """The fits (M,) of rows that lack samples, or whose sums are not the integrals; see `improve`."""
     # They have farther to go than rows with a whole line.
-    for _ in range(2 * ITERATIONS):
+    for _ in range(steps):
         fit = improve(y, x, usable * near(x, fit, REACH, least), fit, limit)
     return fit
 
