@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from boards_by_projection import Head, line_of, picture_of, random_pose, seen, view_of
@@ -20,6 +21,7 @@ from scanmap.solvers.board_line import BoardLine, find_board_line, points_on_boa
 from scanmap.solvers.detection import Rejected, find_board
 from scanmap.solvers.intrinsics import calibrate_camera
 from scanmap.solvers.laser_plane import fit_laser_plane, head_frame_of, plane_in_camera, residual_of, with_laser_plane
+from scanmap.solvers.pictures import Picture, read_pictures
 
 BOARD = parse_board("chessboard:9x6:30mm")
 HEAD = Head()
@@ -208,6 +210,25 @@ def test_the_line_in_a_picture_is_found_on_the_board_alone(picture) -> None:
     off = points @ plane_in_camera(truth)[:3] + plane_in_camera(truth)[3]
     # 0.1 px at half a metre and f 506 px.
     assert np.sqrt((off**2).mean()) < 1.5e-4
+
+
+def test_what_the_file_rounds_is_in_the_lines_sigma(picture, tmp_path) -> None:
+    head, board, _, image = picture
+    (tmp_path / "one.jpg").write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes())
+    (read,) = read_pictures(tmp_path)
+    assert isinstance(read, Picture)
+    view = find_board(read.image, board, "one")
+    assert not isinstance(view, Rejected)
+    told, untold = (
+        find_board_line(read.image, None, view, board, head.truth().intrinsics, LaserLineParams(), 0.02, rounding)
+        for rounding in (read.rounding, None)
+    )
+    assert isinstance(told, BoardLine) and isinstance(untold, BoardLine)
+    assert np.median(told.sigma_px) > 1.05 * np.median(untold.sigma_px)
+    plane = plane_in_camera(head.truth())
+    points = (points_on_board(one, board, head.truth().intrinsics)[0] for one in (told, untold))
+    off, off_untold = (np.sqrt(((p @ plane[:3] + plane[3]) ** 2).mean()) for p in points)
+    assert off < 0.85 * off_untold  # 0.22 and 0.30 mm: it also says which mixture of the channels is best
 
 
 def test_a_dark_laser_is_said_to_be_dark(picture) -> None:

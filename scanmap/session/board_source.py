@@ -9,6 +9,7 @@ from pathlib import Path
 from scanmap.calibration import Calibration
 from scanmap.config import Config
 from scanmap.errors import CalibrationError, CameraError, ConfigError
+from scanmap.laserline import rounding_of
 from scanmap.rig.camera import open_camera
 from scanmap.session.rigs import open_hardware
 from scanmap.shot import decode_image
@@ -111,7 +112,8 @@ def _live(config: Config, size: tuple[int, int] | None, *, laser: bool) -> Itera
                 yield Rejected("the camera", f"{error}; going on with the pictures so far")
                 return
             try:
-                yield Picture(f"picture {number}", decode_image(frame.image).image)
+                image = decode_image(frame.image).image
+                yield Picture(f"picture {number}", image, rounding=rounding_of(frame.image))
             except CameraError as error:
                 yield Rejected(f"picture {number}", str(error))
             number += 1

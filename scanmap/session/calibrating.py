@@ -218,9 +218,8 @@ def _lines(job: BoardJob, base: Calibration, margin_m: float | None) -> tuple[li
 
     def use(picture: Picture, view: View) -> Rejected | None:
         base.check_image(picture.image.shape[1], picture.image.shape[0])
-        found = find_board_line(
-            picture.image, picture.background, view, job.board, base.intrinsics, job.config.laserline, margin
-        )
+        seen_by = base.intrinsics, job.config.laserline, margin, picture.rounding
+        found = find_board_line(picture.image, picture.background, view, job.board, *seen_by)
         if isinstance(found, Rejected):
             return found
         lines.append(found)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Intrinsics
 from scanmap.geometry import intersect_rays_plane
-from scanmap.laserline import LaserLineParams, Reason, find_laser_line
+from scanmap.laserline import LaserLineParams, Reason, Rounding, find_laser_line
 from scanmap.shot import Image
 from scanmap.solvers.board import Board
 from scanmap.solvers.board_pose import BoardPose, board_pose, project
@@ -46,6 +46,7 @@ def find_board_line(
     intrinsics: Intrinsics,
     params: LaserLineParams,
     margin_m: float,
+    rounding: Rounding | None = None,
 ) -> BoardLine | Rejected:
     """The laser line on a board that was found in a picture.
 
@@ -57,6 +58,7 @@ def find_board_line(
         intrinsics: of the camera.
         params: how the line is found.
         margin_m: how far the flat sheet goes on beyond the squares [m].
+        rounding: of the file that the image was.
     """
     view, pose = _steady(view, board, intrinsics)
     if not np.isfinite(pose.residuals).all() or pose.rms_px > 2.0 * max(1.0, intrinsics.width / 1600.0):
@@ -65,7 +67,7 @@ def find_board_line(
         )
     seen = view.board_seen(board)
     window = board_window(pose, seen, intrinsics, margin_m)
-    line = find_laser_line(image, params, background, window)
+    line = find_laser_line(image, params, background, window, rounding)
     rows = np.flatnonzero(line.reason == Reason.OK)
     if len(rows) < ROWS_LEAST:
         return Rejected(view.name, f"laser not visible on the board: {len(rows)} rows with a line, {ROWS_LEAST} needed")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.errors import CalibrationError, CameraError, ConfigError, RecordingError
+from scanmap.laserline import Rounding, rounding_of
 from scanmap.recording import open_source
 from scanmap.recording.frames import SUFFIXES
 from scanmap.recording.video import VIDEO_SUFFIXES
@@ -41,6 +42,7 @@ class Picture(NamedTuple):
     image: Image  # (H, W, 3) BGR
     background: Image | None = None  # the same with the laser off
     bearing: float = float("nan")  # [rad]
+    rounding: Rounding | None = None  # of the file that the image was
 
 
 @dataclass
@@ -121,7 +123,7 @@ def pictures_of(shots: Iterable[Shot]) -> Iterator[Picture | Rejected]:
             continue
         if background is not None and background.shape != image.shape:
             background = None
-        yield Picture(name, image, background, shot.bearing)
+        yield Picture(name, image, background, shot.bearing, rounding_of(shot.image))
 
 
 def _whole(data: bytes) -> Image:
@@ -197,7 +199,8 @@ def _of_folder(path: Path) -> Iterator[Picture | Rejected]:
 def _decoded(files: list[Path]) -> Iterator[Picture | Rejected]:
     for file in files:
         try:
-            yield Picture(file.name, _whole(file.read_bytes()))
+            data = file.read_bytes()
+            yield Picture(file.name, _whole(data), rounding=rounding_of(data))
         except (CameraError, OSError) as error:
             yield Rejected(file.name, str(error))
 
