@@ -26,6 +26,8 @@ from scanmap.scan import Scan
 from scanmap.scan.mirrors import without_mirrors
 from scanmap.triangulation import TriangulationParams, column_window, triangulate
 from scanmap.twin.mesh import Mesh, box, cylinder, merged, quad, wall_with_hole
+from scanmap.twin.room import Room, Thing, assembled, placed
+from scanmap.twin.texture import Material
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -61,8 +63,9 @@ class Pane(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A room in the scanner's frame."""
+    """A room, its rays and its mirrors in the scanner's frame."""
 
+    room: Room
     rays: RayScene
     panes: list[Pane]
     words: str
@@ -87,7 +90,6 @@ def drawn(seed: int, *, mirrors: bool) -> Drawn:
                 "west": ([proud, start, low], [0, wide, 0]),
             }[side]
             panes.append(Pane(np.array(corner), np.array(along, float), np.array([0, 0, high - low])))
-            parts.append(quad(corner, along, [0, 0, high - low]))
         words = ", ".join(f"{np.linalg.norm(pane.a):.1f} x {pane.b[2]:.1f} m" for pane in panes)
         parts.append(quad([length, 0, 0], [0, width, 0], [0, 0, HEIGHT_M]))
     else:
@@ -99,8 +101,15 @@ def drawn(seed: int, *, mirrors: bool) -> Drawn:
         parts += _reveal(hole, length, thick) if thick else []
         parts += _shell(length + thick, depth, width) + _furniture(rng, length + thick, depth, width, at)
         words = f"{'window' if sill else 'door'}, wall {thick:.1f} m, {depth:.1f} m behind it, {length:.1f} m here"
-    mesh = merged(parts)
-    return Drawn(RayScene(mesh.vertices - at, mesh.triangles), [p._replace(corner=p.corner - at) for p in panes], words)
+    things = [(Thing("room", Material((ALBEDO,) * 3)), merged(parts))]
+    things += [
+        (Thing("mirror", Material((0.01,) * 3, gloss=REFLECTANCE), measurable=False), quad(p.corner, p.a, p.b))
+        for p in panes
+    ]
+    lamp = (0.5 * length, 0.5 * width, HEIGHT_M - 0.05)
+    room = placed(assembled("drawn", things, [lamp]), (at[0], at[1]), float(at[2]), 0.0)
+    rays = RayScene(room.vertices, room.triangles)
+    return Drawn(room, rays, [p._replace(corner=p.corner - at) for p in panes], words)
 
 
 def _shell(x: float, length: float, width: float) -> list[Mesh]:

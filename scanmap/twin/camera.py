@@ -117,7 +117,8 @@ class TwinCamera:
         if not laser_on:
             return Frame(self._sensor.read_out(backdrop.coded, backdrop.amplitude, rng), now)
         coded, amplitude = backdrop.coded.copy(), backdrop.amplitude.copy()
-        self._add_line(coded, amplitude, self._fan.draw(self._fan.trace(bearing)), rng)
+        for line in (self._fan.trace(bearing), *self._fan.echoes(bearing)):
+            self._add_line(coded, amplitude, self._fan.draw(line), rng)
         return Frame(self._sensor.read_out(coded, amplitude, rng), now)
 
     def remember(self, bearings: Iterable[float]) -> None:

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from scanmap.calibration import Calibration
-from scanmap.geometry import Array, transform
+from scanmap.geometry import Array, inverse, transform
 from scanmap.raycast import Hits
 from scanmap.twin.optics import Lens
+from scanmap.twin.panes import Pane, panes_of
 from scanmap.twin.scene import Scene
 
 RAYS_PER_ROW = 4
@@ -55,6 +56,18 @@ class LitLine(NamedTuple):
     seen: NDArray[np.bool_]
 
 
+class _Beam(NamedTuple):
+    """Light of the fan on its way. Arrays of length N, in the order of its rays; head frame [m]."""
+
+    points: Array  # (N, 3) what it meets
+    direction: Array  # (N, 3) unit, toward there
+    way: Array  # (N,) from the laser
+    hits: Hits
+    normal: Array  # (3,) of the sheet
+    share: float  # of the laser's light
+    ray: NDArray[np.intp]  # (N,) number of the ray
+
+
 class LineLight(NamedTuple):
     """The line on the sensor: linear light in the columns `first_column` and after."""
 
@@ -77,6 +90,11 @@ class LaserFan:
         optical_axis = calibration.T_head_camera[:3, 2]
         forward = optical_axis - (optical_axis @ self._normal) * self._normal
         forward /= np.linalg.norm(forward)
+        self._panes = panes_of(scene)
+        # What a pane mirrors is drawn ray by ray.
+        self._lobes = scene.gloss[scene.room.thing_of].astype(np.float64)
+        for pane in self._panes:
+            self._lobes[pane.faces] = 0.0
         reach = np.tan(np.radians(0.5 * params.fan_deg))
         count = int(np.clip(RAYS_PER_ROW * 2.0 * reach * own.fy, 500, 40_000))
         # Even in the tangent: evenly many rays per image row, whatever the depth.
@@ -97,42 +115,86 @@ class LaserFan:
     def trace(self, bearing: float) -> LitLine:
         """Where the laser's light falls with the head at `bearing` [rad], and what of it the camera sees."""
         T_world_head = self._mount.T_world_head(bearing)
-        R = T_world_head[:3, :3]
-        hits = self._scene.rays.cast(transform(T_world_head, self.source), self._directions @ R.T, exact=True)
+        return self._lit(T_world_head, self._beam(T_world_head), None)
+
+    def echoes(self, bearing: float) -> list[LitLine]:
+        """The line once more by every flat glossy thing: where that throws the fan, and what is seen in it.
+
+        Of each path one reflection before the surface and one after it.
+        """
+        if not self._panes:
+            return []
+        T_world_head = self._mount.T_world_head(bearing)
+        T_head_world = inverse(T_world_head)
+        panes = [pane.moved(T_head_world) for pane in self._panes]
+        straight = self._beam(T_world_head)
+        found = [self._lit(T_world_head, straight, pane) for pane in panes]
+        for pane in panes:
+            beam = self._turned(T_world_head, straight, pane)
+            found += [self._lit(T_world_head, beam, via) for via in (None, *panes) if len(beam.points)]
+        return [line for line in found if line.seen.any()]
+
+    def _beam(self, T_world_head: Array) -> _Beam:
+        """The fan as it leaves the laser, up to what it meets first."""
+        hits = self._scene.rays.cast(
+            transform(T_world_head, self.source), self._directions @ T_world_head[:3, :3].T, exact=True
+        )
         met = np.flatnonzero(hits.triangle >= 0)
         hits = Hits(hits.distance[met], hits.triangle[met], hits.uv[met])
-        direction, distance = self._directions[met], hits.distance.astype(np.float64)
-        points = self.source + distance[:, None] * direction
+        way, direction = hits.distance.astype(np.float64), self._directions[met]
+        return _Beam(self.source + way[:, None] * direction, direction, way, hits, self._normal, 1.0, met)
+
+    def _turned(self, T_world_head: Array, beam: _Beam, pane: Pane) -> _Beam:
+        """The part of a beam that a pane throws on, up to what it meets then."""
+        on = np.flatnonzero(pane.faces[beam.hits.triangle])
+        direction, normal = pane.turned(beam.direction[on]), pane.turned(beam.normal)
+        start = beam.points[on] + 1e-4 * direction
+        hits = self._scene.rays.cast(transform(T_world_head, start), direction @ T_world_head[:3, :3].T, exact=True)
+        met = np.flatnonzero(hits.triangle >= 0)
+        hits = Hits(hits.distance[met], hits.triangle[met], hits.uv[met])
+        onward, direction = hits.distance.astype(np.float64), direction[met]
+        points = start[met] + onward[:, None] * direction
+        way = beam.way[on][met] + onward
+        return _Beam(points, direction, way, hits, normal, beam.share * pane.reflectance, beam.ray[on][met])
+
+    def _lit(self, T_world_head: Array, beam: _Beam, via: Pane | None) -> LitLine:
+        """What the camera sees of a beam's light, straight or `via` a mirror."""
+        points, hits = beam.points, beam.hits
         world = transform(T_world_head, points)
-        normal = self._scene.rays.normals[hits.triangle] @ R
-        cosine = np.einsum("ij,ij->i", normal, direction)
-        pixel = self._lens.project(points)
+        normal = self._scene.rays.normals[hits.triangle] @ T_world_head[:3, :3]
+        cosine = np.einsum("ij,ij->i", normal, beam.direction)
+        eye = self._camera if via is None else via.image(self._camera)
+
+        def pixels(places: Array) -> Array:
+            return self._lens.project(places if via is None else via.image(places))
+
+        pixel = pixels(points)
         near = (np.abs(pixel / [self._width, self._height] - 0.5) < 0.55).all(axis=1) & (np.abs(cosine) > 1e-3)
         pixel[~near] = np.nan
         seen = near.copy()
-        seen[near] = self._facing_camera(points[near], normal[near], cosine[near])
-        seen[seen] = ~self._scene.rays.occluded(transform(T_world_head, self._camera), world[seen])
-        sigma = self._params.thickness(distance)
+        seen[near] = np.einsum("ij,ij->i", eye - points[near], normal[near]) * -cosine[near] > 0
+        if via is None:
+            seen[seen] = ~self._scene.rays.occluded(transform(T_world_head, self._camera), world[seen])
+        else:
+            seen[seen] = via.shows(self._scene, T_world_head, self._camera, points[seen])
+        # Where a ray is missing in between, the line is cut.
+        seen[:-1] &= (np.diff(beam.ray) == 1) | (beam.share == 1.0)
+        sigma = self._params.thickness(beam.way)
         # A ray beside the fan's middle meets the surface displaced along the surface, not along the plane's normal.
-        displaced = self._normal - direction * (normal @ self._normal / np.where(cosine == 0, 1, cosine))[:, None]
-        step = 0.5 * sigma[:, None] * displaced
-        across = self._lens.project(points + step) - self._lens.project(points - step)
-        light = self._gain * np.abs(cosine) / (distance * sigma)
-        reflected = self._scene.albedo(hits, world) + self._gloss(hits, points, normal, direction)
+        along = normal @ beam.normal / np.where(cosine == 0, 1, cosine)
+        step = 0.5 * sigma[:, None] * (beam.normal - beam.direction * along[:, None])
+        across = pixels(points + step) - pixels(points - step)
+        light = self._gain * np.abs(cosine) / (beam.way * sigma) * beam.share
+        light *= 1.0 if via is None else via.reflectance
+        reflected = self._scene.albedo(hits, world) + self._gloss(hits, points, normal, beam.direction, eye)
         colour = np.array(COLOURS[self._params.colour])
         thing = self._scene.room.thing_of[hits.triangle]
         return LitLine(points, pixel, across, light[:, None] * reflected * colour, normal, thing, seen)
 
-    def _facing_camera(self, points: Array, normal: Array, cosine: Array) -> NDArray[np.bool_]:
-        """Whether camera and laser are on the same side of each surface."""
-        view = np.einsum("ij,ij->i", self._camera - points, normal)
-        facing: NDArray[np.bool_] = view * -cosine > 0
-        return facing
-
-    def _gloss(self, hits: Hits, points: Array, normal: Array, direction: Array) -> Array:
-        """Reflectance (N, 1) of the glossy lobe toward the camera (Blinn 1977)."""
-        gloss = self._scene.gloss[self._scene.room.thing_of[hits.triangle]].astype(np.float64)
-        half = self._camera - points
+    def _gloss(self, hits: Hits, points: Array, normal: Array, direction: Array, eye: Array) -> Array:
+        """Reflectance (N, 1) of the glossy lobe toward the eye (Blinn 1977)."""
+        gloss = self._lobes[hits.triangle]
+        half = eye - points
         half = half / np.linalg.norm(half, axis=1, keepdims=True) - direction
         half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
         lobe = np.abs(np.einsum("ij,ij->i", half, normal)) ** GLOSS_EXPONENT
