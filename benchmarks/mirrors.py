@@ -24,6 +24,7 @@ from scanmap.laserline import LaserLine, Reason
 from scanmap.raycast import RayScene
 from scanmap.scan import Scan
 from scanmap.scan.mirrors import without_mirrors
+from scanmap.scan.second_lines import Pictures
 from scanmap.triangulation import TriangulationParams, column_window, triangulate
 from scanmap.twin.mesh import Mesh, box, cylinder, merged, quad, wall_with_hole
 from scanmap.twin.room import Room, Thing, assembled, placed
@@ -39,6 +40,7 @@ PEAK, FAINT = 0.9 * 2.0**2 / ALBEDO, 0.025  # light of a wall at 2 m, and the le
 COLUMN_PX = 0.04  # noise of a column at half of saturation
 DIM, DIVERGENCE_PX, NEAR_PX = 0.0025, 1.6, 0.6  # of the second look; width of the line far away, and what nearness adds
 HEIGHT_M = 2.6
+MOST = 6  # lines of one path in one row
 
 
 class Pane(NamedTuple):
@@ -141,14 +143,17 @@ def _furniture(rng: np.random.Generator, x: float, length: float, width: float, 
     return parts
 
 
-def sweep(room: Drawn, head: Calibration, bearings: F64, rng: np.random.Generator) -> tuple[Scan, NDArray[np.int8]]:
-    """A scan of the room, and the path (B, H) that each point came on; -1 without a point."""
+def sweep(
+    room: Drawn, head: Calibration, bearings: F64, rng: np.random.Generator
+) -> tuple[Scan, NDArray[np.int8], Pictures]:
+    """A scan of the room, the path (B, H) that each point came on, -1 without a point, and all lines in its pictures."""
     limits = TriangulationParams()
     window, height = column_window(head, limits), head.intrinsics.height
     scan, paths = Scan(head.mount, height), list[NDArray[np.int8]]()
+    places = np.full((len(bearings), height // 8, 4 * MOST), np.inf, np.float32)
     tangent = np.linspace(-FAN, FAN, FAN_RAYS)
     fan = np.stack([np.ones(FAN_RAYS), np.zeros(FAN_RAYS), tangent], axis=1) / np.hypot(1.0, tangent)[:, None]
-    for bearing in bearings:
+    for view, bearing in enumerate(bearings):
         T = head.mount.T_world_head(float(bearing))
         column, light, path = np.full(height, np.nan), np.zeros(height), np.full(height, -1, np.int8)
         for number, image, bright in _lines(room, T[:3, 3], transform(T, head.T_head_camera[:3, 3]), fan @ T[:3, :3].T):
@@ -159,6 +164,9 @@ def sweep(room: Drawn, head: Calibration, bearings: F64, rng: np.random.Generato
                 (np.abs(pixel[:, 1] - row) <= 0.5) & (pixel[:, 0] > window[row, 0]) & (pixel[:, 0] < window[row, 1])
             )
             for k in np.flatnonzero(inside & (bright > FAINT)):
+                if row[k] % 8 == 2:
+                    listed = places[view, row[k] // 8, MOST * number : MOST * (number + 1)]
+                    listed[np.isinf(listed).argmax()] = pixel[k, 0]
                 if bright[k] > light[row[k]]:
                     column[row[k]], light[row[k]], path[row[k]] = pixel[k, 0], bright[k], number
         sigma = COLUMN_PX * np.clip(0.5 / np.maximum(light, 1e-9), 0.7, 6.0)
@@ -171,7 +179,11 @@ def sweep(room: Drawn, head: Calibration, bearings: F64, rng: np.random.Generato
     with np.errstate(invalid="ignore"):
         reflected = scan.intensity * scan.range_m**2 * (DIVERGENCE_PX + NEAR_PX / scan.range_m)
         scan.give_up((scan.intensity < 200.0) & (reflected < DIM * np.nanmedian(reflected)), Reason.AMBIGUOUS)
-    return scan, np.where(scan.valid, np.array(paths), -1).astype(np.int8)
+    middles = 8.0 * np.arange(height // 8) + 1.5
+    T, project = head.mount.T_axis_head(), head.intrinsics.project
+    plane = head.laser_plane @ inverse(T)
+    pictures = Pictures(bearings, places, middles, window, T @ head.T_head_camera, plane, project)
+    return scan, np.where(scan.valid, np.array(paths), -1).astype(np.int8), pictures
 
 
 def _lines(room: Drawn, laser: F64, camera: F64, fan: F64) -> list[tuple[int, F64, F64]]:
@@ -250,8 +262,8 @@ def main() -> None:
         total, false, left, lost = 0, np.zeros(4, int), np.zeros(4, int), 0
         for seed in range(options.rooms):
             room = drawn(seed, mirrors=mirrors)
-            scan, path = sweep(room, head, bearings, np.random.default_rng(seed))
-            gone = scan.valid & ~without_mirrors(scan).valid
+            scan, path, pictures = sweep(room, head, bearings, np.random.default_rng(seed))
+            gone = scan.valid & ~without_mirrors(scan, None, pictures).valid
             off = np.zeros(scan.valid.shape, bool)
             off[scan.valid] = room.rays.distance(scan.points[scan.valid]) > 0.1
             counts = [np.bincount(path[mask], minlength=4) for mask in (off & (path >= 0), off & ~gone & (path >= 0))]

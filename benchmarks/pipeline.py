@@ -158,7 +158,7 @@ def main() -> None:
         replaying = spent(replay)
         looking = spent(lambda: second_look.settle(scan, open_source(path).shots))
     clean: list[Scan] = []
-    finish = spent(lambda: clean.append(finished_scan(scan, config)))
+    finish = spent(lambda: clean.append(finished_scan(scan, config, second_look.pictures())))
     grid = spent(lambda: OccupancyGrid.from_scan(clean[0], config.grid))
     print(f"{'':28s} frames/s  core-ms CPU a frame   replay over it: wall   CPU")
     for name, only in (

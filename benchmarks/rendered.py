@@ -88,7 +88,7 @@ def replay(shots: list[Shot], calibration: Calibration, config: Config) -> tuple
     second = SecondLook(pipeline)
     run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second])
     second.settle(scan, lambda: shots)
-    finished = finished_scan(scan, config)
+    finished = finished_scan(scan, config, second.pictures())
     spent = time.process_time() - start
     return finished, np.bincount(finished.reason.ravel(), minlength=len(Reason)).astype(np.float64), spent
 

@@ -175,8 +175,7 @@ def _look(
     course = search(sight, window - left, params.min_snr, still)
     lines = _found(sight, course, params, windows - left, still)
     lines.column_px[:] += left
-    # What does not change with the laser is gone already where there is a laser-off frame.
-    places = [p + np.float32(left) if background is None else None for p in course.places]
+    places = [own + np.float32(left) for own in course.places]
     return [Look(line, own) for line, own in zip(_each(lines, height), places, strict=True)]
 
 

@@ -65,8 +65,8 @@ class Look(NamedTuple):
     """One picture's laser line, and whatever else in it could be taken for one."""
 
     line: LaserLine  # (H,)
-    # (ceil(H / 8), n) [px] line-like places in every other block of 4 rows, NaN where there are fewer; None where the
-    # laser-off frame has told them from the line.
+    # (ceil(H / 8), n) [px] line-like places in every other block of 4 rows, NaN where there are fewer; None where none
+    # were looked for.
     places: NDArray[np.float32] | None = None
 
 

@@ -15,12 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.geometry import inverse
 from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
 from scanmap.scan import Scan
+from scanmap.scan.second_lines import Pictures
 from scanmap.shot import Shot
 
 F64 = NDArray[np.float64]
@@ -62,7 +64,8 @@ class SecondLook:
         self._keys: list[tuple[float, float]] = []
         self._reflectance: list[F32] = []
         self._ridge: list[F32] = []
-        self._places: list[F32 | None] = []
+        self._places: list[F32 | None] = []  # of pictures without laser-off frames: what does not change is gone there
+        self._listed_in: list[F32 | None] = []
         self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
 
     def __call__(self, step: Step) -> None:
@@ -70,7 +73,9 @@ class SecondLook:
         self._keys.append((step.shot.time, step.shot.bearing))
         self._reflectance.append(_reflectance(step))
         self._ridge.append(ridge_of(step.line.peak, step.line.width_px).astype(np.float32))
-        self._places.append(None if step.fault else step.places)
+        places = None if step.fault else step.places
+        self._places.append(places if step.shot.background is None else None)
+        self._listed_in.append(places)
 
     def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
@@ -116,14 +121,25 @@ class SecondLook:
             wrong[k] |= self._stands(scan, k, known)
         return wrong & scan.valid
 
-    def _stands(self, scan: Scan, k: int, known: _Known, part: float = 1.0) -> Mask:
-        """Rows (H,) that stand still: of all, or once neighbours are known, of those that these do not bear out."""
-        column, share = scan.column_px[k], known.share(k, scan.range_m[k])
-        if known.neighbours is not None:
-            column = np.where(share < SHARE, column, np.nan)
-            if np.isfinite(column).sum() < _LEAST_ROWS:
-                return np.zeros(scan.rows, bool)
-        return known.still.line(float(scan.bearings[k]), column, self._ridge[k], part * share)
+    def pictures(self) -> Pictures | None:
+        """What the pictures list as line-like; None where none does."""
+        some = [k for k, places in enumerate(self._listed_in) if places is not None]
+        if not some:
+            return None
+        own, lists = self._pipeline.calibration, [np.asarray(self._listed_in[k]) for k in some]
+        places = np.full((len(some), len(lists[0]), max(values.shape[1] for values in lists)), np.inf, np.float32)
+        for k, values in enumerate(lists):
+            places[k, :, : values.shape[1]] = np.where(np.isfinite(values), values, np.inf)
+        middles = (2.0 * np.arange(len(lists[0]), dtype=np.float64) + 0.5) * BLOCK - 0.5  # of every other block
+        bearings = np.array([self._keys[k][1] for k in some])
+        window, project = self._pipeline.window, own.intrinsics.project
+        T_axis_head = own.mount.T_axis_head()
+        plane = own.laser_plane @ inverse(T_axis_head)
+        return Pictures(bearings, places, middles, window, T_axis_head @ own.T_head_camera, plane, project)
+
+    def _stands(self, scan: Scan, k: int, still: StillThings, share: float = SHARE) -> Mask:
+        return still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k], share)
+        self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
 
     def _usual(self) -> float:
         known = np.concatenate(

@@ -23,9 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import Reason
-from scanmap.scan.openings import BEHIND_M, openings, walls
+from scanmap.scan.openings import BEHIND_M, Opening, openings, walls
 from scanmap.scan.panorama import Panorama
 from scanmap.scan.range_image import Scan, ScanParams
+from scanmap.scan.second_lines import Pictures, shown
+from scanmap.scan.streaks import streaks
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,6 +39,12 @@ _PATCH_M = 0.15  # what lies in one cube of this size counts once
 _PATCHES = 20  # of upright surfaces, that must agree
 _SUPPORT = 0.15  # of all patches of an opening; where most reflects to what was not swept, a few prove nothing
 _AGREE = 0.97  # share of those that agree or deny, that must agree
+_MOSTLY, _LITTLE = 0.3, 0.1  # of a bearing's cells that hang in the air once reflected; that must tell
+_AS_HIGH = 0.6  # share of the cells of other bearings, where none tells
+_TELLING = 0.2  # cosine of the angle between a surface that tells and the mirror
+_AROUND = np.ones((3, 5), np.uint8)  # columns x rows by which a mirror may be larger than what is seen in it
+_FEW = 0.02  # share of all patches that may deny where nothing compares
+_DEEP_M, _DEEP_SHARE = 1.0, 0.95  # so far behind the wall is nearly all that is seen in a mirror and nothing compares
 _NARROW_M = 0.2  # a surface is wide where the points at the bearings beside are no more than this nearer or farther
 
 
@@ -45,23 +53,23 @@ class Mirror(NamedTuple):
 
     plane: F64  # (4,) n.x + d = 0 in the world frame [m], n toward the scanner
     cells: Mask  # (B, H) of the scan: points that are images
-    agree: int  # patches of upright surfaces on which an image lies
-    deny: int  # patches in which an image hangs in the air
+    agree: int  # patches of upright surfaces on which an image lies, or second lines in pictures
+    deny: int  # patches or cells in which an image hangs in the air
 
 
-def without_mirrors(scan: Scan, params: ScanParams | None = None) -> Scan:
+def without_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pictures | None = None) -> Scan:
     """A copy without the points seen in mirrors (`Reason.MIRROR`); the scan itself where there are none.
 
     Args:
         scan: bearings ascending, as `Scan.merged` leaves them.
     """
-    found = find_mirrors(scan, params)
+    found = find_mirrors(scan, params, pictures)
     if not found:
         return scan
     return scan.without(np.logical_or.reduce([mirror.cells for mirror in found]), Reason.MIRROR)
 
 
-def find_mirrors(scan: Scan, params: ScanParams | None = None) -> list[Mirror]:
+def find_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pictures | None = None) -> list[Mirror]:
     """Upright mirrors on the walls of a scan whose bearings ascend, and the cells that show images in them."""
     every, each = max(1, len(scan) // _COLUMNS), max(1, scan.rows // _ROWS)
     thin = _thinned(scan, every, each)
@@ -70,14 +78,63 @@ def find_mirrors(scan: Scan, params: ScanParams | None = None) -> list[Mirror]:
     seen = Panorama(thin, params or ScanParams())
     found: list[Mirror] = []
     for wall in walls(seen.points[seen.valid], np.nan_to_num(seen.normals[seen.valid])):
-        for cells in openings(seen, wall):
-            offset, agree, deny = _likeness(seen, cells, wall)
-            support = _SUPPORT * len(np.unique(_patches(seen.points[cells])))
-            if agree >= max(_PATCHES, support) and agree >= _AGREE * (agree + deny):
-                seen.valid[cells] = False
-                plane = wall - [0.0, 0.0, 0.0, offset]
-                found.append(Mirror(plane, _behind(scan, wall, cells, every, each), agree, deny))
+        for opening in openings(seen, wall):
+            mirror = _likely(seen, opening, wall) if opening.cut else None
+            if mirror is None and pictures is not None:
+                mirror = _pictured(scan, pictures, seen, opening, wall)
+            if mirror is not None:
+                seen.valid[mirror.cells] = False
+                found.append(mirror._replace(cells=_behind(scan, wall, mirror.cells, every, each)))
+                if pictures is not None:
+                    hole = cv2.dilate(_closed(mirror.cells), _AROUND).astype(bool)
+                    found[-1].cells[:] |= streaks(scan, pictures, seen, mirror.plane, hole)
     return found
+
+
+def _likely(seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
+    """The mirror that an opening is, where the room itself proves it; its cells are those of the panorama."""
+    points = seen.points[opening.cells]
+    offset, agree, deny = _likeness(seen, opening.cells, wall)
+    patches = len(np.unique(_patches(points)))
+    alike = agree >= max(_PATCHES, _SUPPORT * patches) and agree >= _AGREE * (agree + deny)
+    # A wall is not cut without showing how thick it is; what is thinner is a piece of furniture, and not so deep.
+    deep = np.quantile(points @ wall[:3] + wall[3], 1.0 - _DEEP_SHARE) < -_DEEP_M
+    if alike or (opening.framed and deny <= _FEW * patches and deep):
+        return Mirror(wall - [0.0, 0.0, 0.0, offset], opening.cells, agree, deny)
+    return None
+
+
+def _pictured(scan: Scan, pictures: Pictures, seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
+    """The mirror that an opening is, where pictures prove it."""
+    hole = cv2.dilate(_closed(opening.cells), _AROUND).astype(bool)
+    proof = shown(scan, pictures, seen, wall, hole)
+    if not proof.proves(cut=opening.cut):
+        return None
+    cells, hanging = _beside_left(seen, opening, proof.plane)
+    return Mirror(proof.plane, cells, proof.lines, hanging)
+
+
+def _beside_left(seen: Panorama, opening: Opening, plane: F64) -> tuple[Mask, int]:
+    """The cells that are seen in a mirror, without the bearings beside it that hang together with them.
+
+    What hangs in the air once reflected is no image. Floor, ceiling and walls square to the mirror lie on themselves:
+    where nothing else is seen at an end, less of it than elsewhere and no frame around, they stay. Returns also how many
+    cells hang.
+    """
+    cells = opening.cells
+    image = _reflected(seen.points[cells], plane, 0.0)
+    through = np.zeros_like(cells)
+    through[cells] = seen.images(image, seen.tolerance(cells), seen.valid)[2]
+    telling = cells & (np.abs(np.nan_to_num(seen.normals @ plane[:3])) > _TELLING)
+    whole = cells.sum(axis=1)
+    hangs = through.sum(axis=1) > _MOSTLY * whole
+    inside = (opening.framed | (telling.sum(axis=1) > _LITTLE * whole)) & ~hangs & (whole > 0)
+    inside |= (whole >= _AS_HIGH * (np.median(whole[inside]) if inside.any() else np.inf)) & ~hangs
+    ends = np.flatnonzero(inside)
+    kept = cells & ~hangs[:, None]
+    kept[: ends[0] if len(ends) else len(kept)] = False
+    kept[ends[-1] + 1 if len(ends) else 0 :] = False
+    return kept, int(through[kept].sum())
 
 
 def _thinned(scan: Scan, every: int, each: int) -> Scan:
@@ -129,14 +186,17 @@ def _patches(points: F64) -> NDArray[np.int64]:
     return number
 
 
+def _closed(cells: Mask) -> NDArray[np.uint8]:
+    return np.asarray(cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8)), np.uint8)
+
+
 def _behind(scan: Scan, wall: F64, cells: Mask, every: int, each: int) -> Mask:
     """The cells (B, H) of the whole scan behind a wall, in the hole `cells` of the thinned one."""
     column = np.minimum(np.arange(len(scan)) // every, cells.shape[0] - 1)
     row = np.minimum(np.arange(scan.rows) // each, cells.shape[1] - 1)
-    closed = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     # What was left out by thinning lies around.
     around = np.ones((3 if every > 1 else 1, 3), np.uint8)
-    hole = cv2.dilate(closed, around).astype(bool)[column][:, row]
+    hole = cv2.dilate(_closed(cells), around).astype(bool)[column][:, row]
     with np.errstate(invalid="ignore"):
         behind = scan.points @ wall[:3].astype(np.float32) + np.float32(wall[3]) < -BEHIND_M - 3.0 * scan.sigma_m
     images: Mask = behind & hole

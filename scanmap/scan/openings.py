@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -62,25 +64,33 @@ def walls(points: F64, facing: F64) -> list[F64]:
     return planes
 
 
-def openings(seen: Panorama, wall: F64) -> list[Mask]:
-    """What is seen through a wall: connected cells (B, H) behind its plane that are cut out of it sharply."""
+class Opening(NamedTuple):
+    """What is seen through a wall as if it were cut out."""
+
+    cells: Mask  # (B, H) connected, with points behind the wall's plane
+    cut: bool  # its ends are sharp, and on the wall
+    framed: bool  # so are nearly all the upper and all the lower ones, seen at nearly every bearing
+
+
+def openings(seen: Panorama, wall: F64) -> list[Opening]:
+    """All that is seen through a wall."""
     height = seen.points @ wall[:3] + wall[3]
     behind = seen.valid & (height < -BEHIND_M - 3.0 * seen.sigma)
     # A faint image is full of gaps: they are bridged, but for points that lie before the wall.
     closed = cv2.morphologyEx(behind.astype(np.uint8), cv2.MORPH_CLOSE, _BRIDGE) * (behind | ~seen.valid)
     count, label, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    found = list[Mask]()
+    found = list[Opening]()
     for k in range(1, count):
         if stats[k, cv2.CC_STAT_AREA] >= _CELLS:
             cells = behind & (label == k)
-            sharp, on_wall = _rim(seen, cells, wall, height)
-            if sharp >= _SHARP and on_wall >= _ON_WALL:
-                found.append(cells)
+            sharp, on_wall, framed = _rim(seen, cells, wall, height)
+            cut = sharp >= _SHARP and on_wall >= _ON_WALL
+            found.append(Opening(cells, cut, cut and framed))
     return found
 
 
-def _rim(seen: Panorama, cells: Mask, wall: F64, height: F64) -> tuple[float, float]:
-    """How a hole `cells` (B, H) ends: the share of its ends that is cut sharply, and that lies on the wall.
+def _rim(seen: Panorama, cells: Mask, wall: F64, height: F64) -> tuple[float, float, bool]:
+    """How a hole `cells` (B, H) ends: the share of its ends that is cut sharply, and that lies on the wall; framed?
 
     Args:
         height: (B, H) of the points before the wall [m].
@@ -88,7 +98,7 @@ def _rim(seen: Panorama, cells: Mask, wall: F64, height: F64) -> tuple[float, fl
     Surfaces that run on through the wall's plane, and reveals, are no sharp ends. Of the ends along the rows and those
     along the bearings the less sharp count.
     """
-    sharp, on_wall, enough = list[float](), list[Mask](), True
+    sharp, on_wall, enough, framed = list[float](), list[Mask](), True, True
     for axis in (1, 0):
         inside, valid = (mask if axis else mask.T for mask in (cells, seen.valid))
         line = np.flatnonzero(inside.any(axis=1))
@@ -105,11 +115,12 @@ def _rim(seen: Panorama, cells: Mask, wall: F64, height: F64) -> tuple[float, fl
             # Between bearings far apart a frame may stand unseen, and a corner be stepped over.
             near = np.abs(seen.bearings[rim[0]] - seen.bearings[edge[0]]) * seen.distance[rim] < _APART_M
             cut.append(_cut(seen, rim, edge, wall)[near])
+            framed &= not axis or (cut[-1] & on_wall[-1][near]).sum() >= _SHARP * len(line)
         ends_cut = np.concatenate(cut)
         enough &= not axis or len(ends_cut) >= max(_ENDS, 0.5 * len(line))  # an end may be out of view
         sharp.append(float(ends_cut.mean()) if len(ends_cut) else 1.0)
     closed = np.concatenate(on_wall)
-    return (min(sharp) if enough else 0.0), float(closed.mean()) if len(closed) else 0.0
+    return (min(sharp) if enough else 0.0), float(closed.mean()) if len(closed) else 0.0, bool(framed)
 
 
 def _cut(seen: Panorama, rim: tuple[Index, Index], first: tuple[Index, Index], wall: F64) -> Mask:

@@ -22,6 +22,7 @@ from scanmap.pipeline import Pipeline, Processes, Runner, SecondLook, Sink, Step
 from scanmap.recording import Recorder, first_part
 from scanmap.scan import Scan
 from scanmap.scan.mirrors import without_mirrors
+from scanmap.scan.second_lines import Pictures
 from scanmap.scan.surface import remove_outliers
 from scanmap.session.noting import noting
 from scanmap.session.outputs import Outputs, write_results
@@ -147,7 +148,7 @@ class Job:
         if self.config.scan.second_look:
             own = self.shots if self.recorded else None
             self.faults += settle(second_look, scan, [self.earlier, read_again(self.recorder) or own], self._withdrawn)
-        return self._finished(scan, ended, error)
+        return self._finished(scan, second_look.pictures(), ended, error)
 
     def withdraw(self, indices: Collection[int], why: Withdrawal) -> None:
         """Take back shots handed out so far: they stay in the recording, but nothing is made of them."""
@@ -226,10 +227,10 @@ class Job:
         except RecordingError as error:
             self.faults.append(str(error))
 
-    def _finished(self, scan: Scan, ended: str, error: Exception | None) -> Result:
+    def _finished(self, scan: Scan, pictures: Pictures | None, ended: str, error: Exception | None) -> Result:
         if self._withdrawn:
             scan = scan.taken(np.array([k for k in range(len(scan)) if k not in self._withdrawn], np.intp))
-        clean = finished_scan(scan, self.config)
+        clean = finished_scan(scan, self.config, pictures)
         summary = summarise(clean, self.calibration)
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
         if summary.points:
@@ -309,9 +310,13 @@ def is_scan_file(path: Path) -> bool:
     return path.suffix.lower() == ".ply" and not path.name.lower().endswith("mesh.ply")
 
 
-def finished_scan(scan: Scan, config: Config) -> Scan:
-    """Passes merged, sorted by bearing, outliers and what was seen in mirrors removed."""
+def finished_scan(scan: Scan, config: Config, pictures: Pictures | None = None) -> Scan:
+    """Passes merged, sorted by bearing, outliers and what was seen in mirrors removed.
+
+    Args:
+        pictures: what they show beside the line, which proves more mirrors.
+    """
     finished = scan.merged(config.scan.merge_deg)
     if config.scan.filter_outliers:
         finished = remove_outliers(finished, config.scan)
-    return without_mirrors(finished, config.scan) if config.scan.mirrors else finished
+    return without_mirrors(finished, config.scan, pictures) if config.scan.mirrors else finished
