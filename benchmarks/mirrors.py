@@ -146,7 +146,7 @@ def _furniture(rng: np.random.Generator, x: float, length: float, width: float, 
 def sweep(
     room: Drawn, head: Calibration, bearings: F64, rng: np.random.Generator
 ) -> tuple[Scan, NDArray[np.int8], Pictures]:
-    """A scan of the room, the path (B, H) that each point came on, -1 without a point, and all lines in its pictures."""
+    """A scan of the room, the path (B, H) that each point came on, -1 without one, and all lines in its pictures."""
     limits = TriangulationParams()
     window, height = column_window(head, limits), head.intrinsics.height
     scan, paths = Scan(head.mount, height), list[NDArray[np.int8]]()

@@ -258,6 +258,51 @@ def test_colour_of_laser_and_surface_multiply() -> None:
     np.testing.assert_allclose(green / green[1], [0.1 / 2, 1.0, 0.12 * 4], rtol=1e-5)
 
 
+def test_a_mirror_throws_the_line_and_shows_it_where_optics_says() -> None:
+    """A wall at x = 2 with a mirror on it, another wall behind the head: every echo lies on what it shines on."""
+    head = thesis_head()
+    mirror = Thing("mirror", Material((0.01, 0.01, 0.01), gloss=0.8))
+    back = Thing("back", Material((0.5, 0.5, 0.5)))
+    pane, wall = quad([2.0, -1.0, -0.5], [0, 0, 1.0], [0, 2.0, 0]), quad([-1.5, -3, -2], [0, 6.0, 0], [0, 0, 4.0])
+    scene = Scene(assembled("test", [(mirror, pane), (back, wall)], [(0.0, 0.0, 1.0)]), DARK)
+    fan = LaserFan(scene, head, LaserParams(), 0.6)
+    (both,) = fan.echoes(0.0)  # the camera looks away from what the mirror lights
+    seen = both.points[both.seen]
+    assert len(seen) > 1000
+    np.testing.assert_allclose(seen[:, 0], -1.5, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 1], 0.0, atol=1e-6)
+    # It is where the image of the wall is, 5.5 m away in the laser's plane, and as bright as that, twice mirrored.
+    image = seen * [-1.0, 1.0, 1.0] + [4.0, 0.0, 0.0]
+    np.testing.assert_allclose(both.pixel[both.seen], Lens(head).project(image), atol=1e-3)
+    far = quad([5.5, -3.0, -2.0], [0, 0, 4.0], [0, 6.0, 0])
+    alone = Scene(assembled("far", [(back, far)], [(0.0, 0.0, 1.0)]), DARK)
+    straight = LaserFan(alone, head, LaserParams(), 0.6).trace(0.0)
+    level = np.abs(straight.points[:, 2]) < 0.3
+    mirrored = both.peak[both.seen & (np.abs(both.points[:, 2]) < 0.3)]
+    np.testing.assert_allclose(mirrored.mean(axis=0), 0.64 * straight.peak[level].mean(axis=0), rtol=1e-3)
+
+
+def test_a_mirror_beside_the_plane_shows_the_line_on_a_wall_once_more() -> None:
+    head = thesis_head()
+    mirror, paint = Thing("mirror", Material((0.01, 0.01, 0.01), gloss=0.8)), Thing("wall", Material((0.5, 0.5, 0.5)))
+    wall, pane = quad([3.0, -3.0, -1.0], [0, 0, 2.0], [0, 6.0, 0]), quad([1.0, -0.5, -1.0], [1.9, 0, 0], [0, 0, 2.0])
+    scene = Scene(assembled("test", [(paint, wall), (mirror, pane)], [(0.0, 0.0, 1.0)]), DARK)
+    (again,) = LaserFan(scene, head, LaserParams(), 0.6).echoes(0.0)
+    seen = again.points[again.seen]
+    np.testing.assert_allclose(seen[:, :2], np.broadcast_to([3.0, 0.0], (len(seen), 2)), atol=1e-6)
+    np.testing.assert_allclose(
+        again.pixel[again.seen], Lens(head).project(seen * [1, -1, 1] + [0.0, -1.0, 0.0]), atol=1e-3
+    )
+    assert len(seen) > 300
+
+
+def test_rooms_without_large_flat_glossy_things_have_no_echoes() -> None:
+    assert (
+        LaserFan(scene_of(quad([2.0, -1, -1], [0, 0, 2.0], [0, 2.0, 0])), thesis_head(), LaserParams(), 0.6).echoes(0.0)
+        == []
+    )
+
+
 def test_line_agrees_with_pictures_of_another_renderer() -> None:
     """Mitsuba's frames of the rendered room: the same mesh in our twin gives the same columns."""
     if not RENDERED.exists():

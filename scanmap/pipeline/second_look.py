@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.geometry import inverse
 from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.running import run
@@ -134,12 +133,17 @@ class SecondLook:
         bearings = np.array([self._keys[k][1] for k in some])
         window, project = self._pipeline.window, own.intrinsics.project
         T_axis_head = own.mount.T_axis_head()
-        plane = own.laser_plane @ inverse(T_axis_head)
+        plane = own.laser_plane @ np.linalg.inv(T_axis_head)
         return Pictures(bearings, places, middles, window, T_axis_head @ own.T_head_camera, plane, project)
 
-    def _stands(self, scan: Scan, k: int, still: StillThings, share: float = SHARE) -> Mask:
-        return still.line(float(scan.bearings[k]), scan.column_px[k], self._ridge[k], share)
-        self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
+    def _stands(self, scan: Scan, k: int, known: _Known, part: float = 1.0) -> Mask:
+        """Rows (H,) that stand still: of all, or once neighbours are known, of those that these do not bear out."""
+        column, share = scan.column_px[k], known.share(k, scan.range_m[k])
+        if known.neighbours is not None:
+            column = np.where(share < SHARE, column, np.nan)
+            if np.isfinite(column).sum() < _LEAST_ROWS:
+                return np.zeros(scan.rows, bool)
+        return known.still.line(float(scan.bearings[k]), column, self._ridge[k], part * share)
 
     def _usual(self) -> float:
         known = np.concatenate(

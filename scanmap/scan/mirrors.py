@@ -40,6 +40,7 @@ _PATCHES = 20  # of upright surfaces, that must agree
 _SUPPORT = 0.15  # of all patches of an opening; where most reflects to what was not swept, a few prove nothing
 _AGREE = 0.97  # share of those that agree or deny, that must agree
 _MOSTLY, _LITTLE = 0.3, 0.1  # of a bearing's cells that hang in the air once reflected; that must tell
+_HANGING = 0.1  # share of all cells that may hang, at most
 _AS_HIGH = 0.6  # share of the cells of other bearings, where none tells
 _TELLING = 0.2  # cosine of the angle between a surface that tells and the mirror
 _AROUND = np.ones((3, 5), np.uint8)  # columns x rows by which a mirror may be larger than what is seen in it
@@ -111,6 +112,8 @@ def _pictured(scan: Scan, pictures: Pictures, seen: Panorama, opening: Opening, 
     if not proof.proves(cut=opening.cut):
         return None
     cells, hanging = _beside_left(seen, opening, proof.plane)
+    if hanging > _HANGING * cells.sum():
+        return None
     return Mirror(proof.plane, cells, proof.lines, hanging)
 
 
@@ -118,8 +121,8 @@ def _beside_left(seen: Panorama, opening: Opening, plane: F64) -> tuple[Mask, in
     """The cells that are seen in a mirror, without the bearings beside it that hang together with them.
 
     What hangs in the air once reflected is no image. Floor, ceiling and walls square to the mirror lie on themselves:
-    where nothing else is seen at an end, less of it than elsewhere and no frame around, they stay. Returns also how many
-    cells hang.
+    where nothing else is seen at an end, less of it than elsewhere and no frame around, they stay. Returns also how
+    many cells hang.
     """
     cells = opening.cells
     image = _reflected(seen.points[cells], plane, 0.0)

@@ -33,8 +33,10 @@ _SLACK_M = 0.1  # by which a mirror may throw the fan elsewhere than the wall's 
 _OFFSETS_M = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, 0.04)  # of the mirror before the wall it hangs on
 _TURNS = tuple(np.radians([0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6]))  # of a wall of which few bearings tell
 _MET_PX, _EDGE_PX = 4.0, 5.0  # how near a line must be; so near the border of the window none is listed
+_FAR_PX = 30.0  # how near one is at least, though the mirror lies beside the wall's plane
 _OWN_PX = 8.0  # what is so near the line itself says nothing
-_VIEW_SHARE, _VIEW_LEAST, _LEAST = 0.6, 6, 24  # of images met in a picture that shows them; in all such pictures
+_VIEW_SHARE, _VIEW_LEAST = 0.6, 6  # of images met in a picture that shows them
+_SHARE, _LEAST = 0.1, 24  # in all such pictures
 
 
 class Pictures(NamedTuple):
@@ -55,15 +57,20 @@ class Pictures(NamedTuple):
 
     def within(self, scan: Scan, points: F64, hole: Mask) -> Mask:
         """Whether points (N, 3) lie in the directions of the cells `hole` (b, h) of an evenly thinned scan."""
-        turn = np.arctan2(points[:, 1], points[:, 0])
-        row = self.pixels(turned(points, -turn))[:, 1]
         every, each = max(1, len(scan) // hole.shape[0]), scan.rows / hole.shape[1]
-        apart = np.abs((turn[:, None] - scan.bearings[::every][: len(hole)] + np.pi) % (2.0 * np.pi) - np.pi)
-        # A mirror that reaches out of view goes on there.
-        seen: Mask = (np.abs(row / scan.rows - 0.5) < _BEYOND) & (apart.min(axis=1, initial=np.inf) < 2.0 * _APART)
+        bearings = scan.bearings[::every][: len(hole)]
+        turn = np.arctan2(points[:, 1], points[:, 0])
+        # From half a turn before the middle bearing to half a turn after it.
+        turn += 2.0 * np.pi * np.round((0.5 * (bearings[0] + bearings[-1]) - turn) / (2.0 * np.pi))
+        after = np.clip(np.searchsorted(bearings, turn), 1, len(bearings) - 1)
+        column = after - (turn - bearings[after - 1] < bearings[after] - turn)
+        seen: Mask = np.any(hole, axis=1)[column]
+        seen &= np.abs(turn - bearings[column]) < 2.0 * _APART
         k = np.flatnonzero(seen)
-        column = apart[k].argmin(axis=1)
-        seen[k] = hole[column, np.clip(row[k] / each, 0, hole.shape[1] - 1).astype(np.intp)]
+        row = self.pixels(turned(points[k], -turn[k]))[:, 1]
+        # A mirror that reaches out of view goes on there.
+        seen[k] = np.abs(row / scan.rows - 0.5) < _BEYOND
+        seen[k] &= hole[column[k], np.clip(row / each, 0, hole.shape[1] - 1).astype(np.intp)]
         return seen
 
 
@@ -73,17 +80,18 @@ class Shown(NamedTuple):
     plane: F64  # (4,) n.x + d = 0 [m] that explains the most
     lines: int  # blocks of rows with a second line where it must be, in pictures that show most of theirs
     views: int  # such pictures
+    asked: int  # blocks of rows where it would be, if the opening were all mirror
 
     def proves(self, *, cut: bool) -> bool:
         """Whether there is a mirror; one picture is enough where the opening is cut as a mirror is."""
-        return self.lines >= _LEAST and self.views >= (1 if cut else 2)
+        return self.lines >= max(_LEAST, _SHARE * self.asked) and self.views >= (1 if cut else 2)
 
 
 class _Seen(NamedTuple):
-    """Points that the laser lights straight, seen by way of the mirror; N as if their pictures were taken at bearing 0."""
+    """Points that the laser lights straight, seen by way of the mirror."""
 
-    points: F64  # (N, 3) [m]
-    turn: F64  # (N,) the bearing [rad]
+    points: F64  # (N, 3) as if the picture were taken at bearing 0 [m]
+    turn: F64  # (N,) its bearing [rad]
     view: Index  # (N,) the picture
 
     def lines(self, plane: F64) -> tuple[F64, Index]:
@@ -130,14 +138,16 @@ def shown(scan: Scan, pictures: Pictures, seen: Panorama, wall: F64, hole: Mask)
     own[views] = scan.column_px[columns]
     way = np.nan_to_num(seen.points[hole & seen.valid]).mean(axis=0)
     foot = way * (-wall[3] / (way @ wall[:3]))
-    best = Shown(wall, 0, 0)
+    best = Shown(wall, 0, 0, 0)
+    if sum(_met(pictures, own, *kind.lines(wall), _FAR_PX)[0] for kind in lit) < _LEAST:
+        return best
     for turn in _TURNS:
         normal = turned(wall[None, :3], np.array([turn]))[0]
         for offset in _OFFSETS_M:
             plane = np.append(normal, -normal @ foot - offset)
             met = np.array([_met(pictures, own, *kind.lines(plane)) for kind in lit]).sum(axis=0)
             if met[0] > best.lines:
-                best = Shown(plane, int(met[0]), int(met[1]))
+                best = Shown(plane, *map(int, met))
     return best
 
 
@@ -172,6 +182,12 @@ def _by_laser(
     scan: Scan, pictures: Pictures, views: tuple[Index, Index], seen: Panorama, wall: F64, hole: Mask
 ) -> _Thrown:
     """Surfaces, swept at other bearings, on which the fan may fall by way of the opening."""
+    # Only pictures whose light goes into the opening.
+    reach = np.deg2rad(1.0) + np.abs(np.diff(seen.bearings)).max(initial=0.0)
+    into = (
+        np.abs(pictures.bearings[views[0], None] - seen.bearings[hole.any(axis=1)]).min(axis=1, initial=np.inf) < reach
+    )
+    views = views[0][into], views[1][into]
     turn = pictures.bearings[views[0]]
     sheet = np.broadcast_to(pictures.laser_plane, (len(turn), 4)).copy()
     sheet[:, :3] = turned(sheet[:, :3], turn)
@@ -214,8 +230,8 @@ def turned(points: F64, turn: F64) -> F64:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
-def _met(pictures: Pictures, own: F32, points: F64, view: Index) -> tuple[int, int]:
-    """In how many blocks of rows pictures list a line, of those that list most that they must; and how many do.
+def _met(pictures: Pictures, own: F32, points: F64, view: Index, within_px: float = _MET_PX) -> tuple[int, int, int]:
+    """In how many blocks of rows pictures list a line, of those that list most; how many do; in how many they must.
 
     Args:
         own: (V, H) columns of the line itself.
@@ -228,8 +244,8 @@ def _met(pictures: Pictures, own: F32, points: F64, view: Index) -> tuple[int, i
     near = np.abs(row - pictures.rows[block]) <= 0.5 * _ROWS
     near &= (column > pictures.window[at, 0] + _EDGE_PX) & (column < pictures.window[at, 1] - _EDGE_PX)
     near &= ~(np.abs(own[view, at] - column) < _OWN_PX)
-    hit = near & (np.abs(pictures.places[view, block] - column[:, None]).min(axis=1) <= _MET_PX)
+    hit = near & (np.abs(pictures.places[view, block] - column[:, None]).min(axis=1) <= within_px)
     count, views = len(pictures.rows), len(pictures.bearings)
     asked, met = (np.bincount(np.unique(view[k] * count + block[k]) // count, minlength=views) for k in (near, hit))
     most = (met >= _VIEW_LEAST) & (met >= _VIEW_SHARE * asked)
-    return int(met[most].sum()), int(most.sum())
+    return int(met[most].sum()), int(most.sum()), int(asked.sum())
