@@ -264,7 +264,6 @@ def test_a_window_of_nothing_gives_nothing():
 
 # What the detector does not manage: name, in colour, with an off frame.
 BEYOND = {
-    ("white text", True, False),
     ("white text", False, False),
     # Without colour and without an off frame a tube is a line; which of the two moves only the next bearing tells.
     ("tube of light", False, False),

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from synthetic_lines import HARD, Room, hard_frame, line_light, score, sensor
+from synthetic_lines import HARD, RED, Room, hard_frame, line_light, score, sensor
 
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
 
@@ -54,3 +54,35 @@ def test_a_laser_whose_colour_is_less_than_pure_nothing(laser, name):
     found, false = score(find_laser_line(picture, GAUSS).column_px, frame)
     assert found >= 0.99
     assert false <= 0.002
+
+
+def across_an_edge(left, right, seed=0):
+    """A line that crosses an upright edge of two colours (BGR) aslant; its columns."""
+    column = 180.0 + 0.1 * np.arange(400)
+    light = np.full((400, 400, 3), left, np.float32)
+    light[:, 200:] = right
+    light = cv2.GaussianBlur(light, (0, 0), 0.7) + line_light(column, 90.0, 1.6, 400)[..., None] * np.float32(RED)
+    return sensor(light, 1.5, np.random.default_rng(seed)), column
+
+
+@pytest.mark.parametrize("right", [(120.0, 120.0, 120.0), (60.0, 95.0, 130.0), (150.0, 110.0, 80.0)])
+def test_a_line_across_an_edge_of_eight_times_the_brightness(right):
+    off, scaled = [], []
+    for seed in range(4):
+        image, column = across_an_edge((14.0, 14.0, 16.0), right, seed)
+        line = find_laser_line(image, GAUSS)
+        off.append(line.column_px - column)
+        scaled.append(off[-1] / line.sigma_px)
+    # Within 5 px of the edge; by brightness alone 1.6 px, and 2 sigmas.
+    near = np.abs(column - 199.5) < 5.0
+    assert np.isfinite(off).mean() >= 0.93
+    assert np.sqrt(np.nanmean(np.square(off)[:, near])) <= 1.0
+    assert np.nanstd(np.array(scaled)[:, near]) <= 1.6
+
+
+def test_white_print_under_the_line():
+    for seed in range(4):
+        frame = hard_frame("white text", seed)
+        found, false = score(find_laser_line(frame.image, GAUSS).column_px, frame)
+        assert found >= 0.97
+        assert false <= 0.002

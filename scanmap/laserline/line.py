@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scanmap.laserline import runs
 from scanmap.laserline.bars import take_bars
+from scanmap.laserline.beside_print import apart_from_print
 from scanmap.laserline.brightness import by_brightness
 from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import judged_channel
@@ -19,7 +20,7 @@ from scanmap.laserline.edges import across_edges, doubt_of_edges, sides_of
 from scanmap.laserline.error_bars import Doubts, no_doubts, with_error_bars
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
-from scanmap.laserline.offframe import borne_out, standing_out
+from scanmap.laserline.offframe import told_from_edges
 from scanmap.laserline.offmatch import in_place
 from scanmap.laserline.onward import gaps_in, goes_on
 from scanmap.laserline.params import LaserLineParams
@@ -43,10 +44,8 @@ _MARGIN = 64
 _SIGMA_LEAST_PX = 0.003
 # A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
-# Short runs of rows known no better than this are given up, and those that stand out of what is left of the room's own
-# edges by no more than the second; single rows by no more than the first.
-_WEAK_PX, _STANDS_OUT = 0.2, (2.5, 4.5)
-_BLOCKS_ROWS = 18
+# Short runs of rows known no better than this are given up.
+_WEAK_PX = 0.2
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Share of its rows in which a picture must show the line to be thought of the laser's colour.
@@ -214,14 +213,7 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
             _go_on(one, doubts.of(own), picture, params, (window[own], free[own]), still)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
-        standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
-        line = without(line, standing < _STANDS_OUT[0], Reason.AMBIGUOUS)
-        # Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
-        disturbed = with_ripple < _STANDS_OUT[1]
-        borne = borne_out(line.column_px, disturbed | weak, _BLOCKS_ROWS, sight.lit, sight.off, sight.gain)
-        disturbed &= ~borne
-        line = without(line, runs.crumbs(line.column_px, disturbed, height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
-        weak = (weak | disturbed) & ~borne
+        line, weak = told_from_edges(line, weak, sight)
     line = without(line, runs.crumbs(line.column_px, weak, height), Reason.AMBIGUOUS)
     line.column_px[:] += doubts.edges.shift
     return with_error_bars(line, sight, params.pool_rows, doubts)
@@ -237,7 +229,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
     around = samples_of(sight, row, column)
     # Speckle is one for a picture; the largest group, which comes first, tells it best.
     contrast = {"auto": np.nan, "additive": 0.0, "speckle": SPECKLE_FROM + 0.1}[params.noise]
-    contrasts = np.full(len(sight.noise), contrast)
+    contrasts, usual = np.full(len(sight.noise), contrast), np.full(len(sight.noise), np.nan, np.float32)
     for half, some in by_width(around.lit, around.rows):
         r, c, rows = row[some], column[some], around.rows.of(some)
         noise = rows.noise
@@ -247,6 +239,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some), limit)
         contrasts = peaks.contrast
         reason = judged(peaks, noise, params)
+        apart_from_print(peaks, reason, sight, (r, c), rows, params, usual)
         # A wide saturated line whose flanks are no Gaussian's stands in a halo.
         misfit = np.float32(_HALO_MISFIT) * np.maximum(noise, np.float32(1.5))
         halo = peaks.clipped & (peaks.width_px > _HALO_WIDTH_PX) & (peaks.noise > misfit)

@@ -7,12 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.path import strips
-from scanmap.laserline.runs import GAP_ROWS, numbered
+from scanmap.laserline.result import LaserLine, Reason, without
+from scanmap.laserline.runs import GAP_ROWS, crumbs, numbered
+from scanmap.laserline.sight import Sight
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+# What stands out of what is left of the room's own edges by no more than this is given up: single rows by the first,
+# short runs by the second. Two compressions of one picture differ by blocks of 8 rows, and of 16 in colour.
+_STANDS_OUT, _BLOCKS_ROWS = (2.5, 4.5), 18
 _REACH = 2  # [px] on either side of a place whose contrast counts
 _CONTRAST = 16  # [grey levels] from which on a place has any
 _BRIGHTEST = 240  # [grey levels] brighter ones are cut
@@ -26,6 +31,18 @@ _RUN_ROWS, _STRAIGHT_PX = 4, 0.8
 _HALF, _BESIDE_PX, _AWAY_PX = 40, 9, 6
 # How much higher a run is than all of those, and than what neighbouring columns of the laser-off frame differ by.
 _HIGHER, _STEEPER = 2.0, 1.5
+
+
+def told_from_edges(line: LaserLine, weak: Mask, sight: Sight) -> tuple[LaserLine, Mask]:
+    """The line of one picture without what edges of the room leave of its laser-off frame; and rows (H,) still weak."""
+    assert sight.off is not None
+    standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
+    line = without(line, standing < _STANDS_OUT[0], Reason.AMBIGUOUS)
+    disturbed = with_ripple < _STANDS_OUT[1]
+    borne = borne_out(line.column_px, disturbed | weak, _BLOCKS_ROWS, sight.lit, sight.off, sight.gain)
+    disturbed &= ~borne
+    line = without(line, crumbs(line.column_px, disturbed, sight.height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
+    return line, (weak | disturbed) & ~borne
 
 
 def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> tuple[F64, F64]:
