@@ -2,9 +2,9 @@
 
     python benchmarks/error_bars.py [--frames 1000]
 
-Frames of 320 rows drawn at random: quality 75 to 95, 4:4:4, 4:2:2 or 4:2:0, red or green laser, height 30 to 230 grey
-levels, sigma 1 to 4 px, noise 1 to 6, half of them through a tone curve; a third of the lines upright, a third leaning
-by 0.002 to 0.03 columns a row, a third slanted by 0.08 to 0.3. z is the root mean square of error over sigma_px, each
+Frames of 320 rows drawn at random: quality 75 to 95, 4:4:4, 4:2:2 or 4:2:0, red or green laser, height 30 to 1000 grey
+levels (from about 240 they saturate), sigma 1 to 4 px, noise 1 to 6, half of them through a tone curve; a third of the
+lines upright, a third leaning by 0.002 to 0.03 columns a row, a third slanted by 0.08 to 0.3. z is the root mean square of error over sigma_px, each
 row by itself and pooled over nine; beside it z where the file's own rounding is kept from the detector.
 """
 
@@ -33,7 +33,7 @@ ROWS = 320
 LEAN = {"upright": (0.0, 0.0), "leaning": (0.002, 0.03), "slanted": (0.08, 0.3)}
 BANDS = {
     "quality": (75, 80, 85, 90, 96),
-    "height": (30, 50, 85, 140, 231),
+    "height": (30, 50, 85, 140, 240, 500, 1000),
     "sigma": (1, 1.5, 2, 3, 4),
     "noise": (1, 1.8, 3.3, 6),
 }
@@ -44,7 +44,7 @@ def measured(rng: np.random.Generator) -> Frame:
     how = str(rng.choice(list(LEAN)))
     lean = rng.choice([-1.0, 1.0]) * rng.uniform(*LEAN[how])
     frame: Frame = {
-        "quality": float(rng.integers(75, 96)), "height": float(np.exp(rng.uniform(*np.log([30, 230])))),
+        "quality": float(rng.integers(75, 96)), "height": float(np.exp(rng.uniform(*np.log([30, 1000])))),
         "sigma": rng.uniform(1, 4), "noise": float(np.exp(rng.uniform(0, np.log(6)))),
         "sampling": str(rng.choice(list(SAMPLING))), "line": how,
     }  # fmt: skip

@@ -11,11 +11,13 @@ from test_calibrate_self import run, twin_recording
 from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import Uncertainty
 from scanmap.errors import CalibrationError
+from scanmap.geometry import HeadMount, inverse, transform
 from scanmap.solvers.check import check
 from scanmap.solvers.check_words import notes, verdict_lines
+from scanmap.solvers.flat_segments import Segments
 from scanmap.solvers.passes import compare_passes
-from scanmap.solvers.sight import Lines
-from scanmap.solvers.walls import CheckParams
+from scanmap.solvers.sight import Lines, Patches
+from scanmap.solvers.walls import CheckParams, walls_under
 
 NOISE_PX = 0.01
 
@@ -98,3 +100,19 @@ def test_the_command_fails_and_passes_by_its_exit_code(tmp_path: Path, capsys: p
     code, said, complaint = run(capsys, "check", str(recording))
     assert code == 0 and "PASS: nothing in this scan contradicts" in said, complaint
     assert Calibration.load(path).residuals == {"self_rms_px": 7.0}
+
+
+@pytest.mark.parametrize("arc_m", [0.012, -0.008])
+def test_a_walls_bow_is_its_arc_and_positive_where_its_ends_come_nearer(arc_m: float) -> None:
+    """A wall 2 m away, from 1.2 m to the left to 1.2 m to the right, its ends nearer by the arc."""
+    exact = replace(head(), mount=HeadMount())
+    along, z = np.linspace(-1.2, 1.2, 41)[:, None], np.linspace(-0.4, 0.4, 9)
+    x = np.broadcast_to(2.0 - arc_m * (along / 1.2) ** 2, (41, 9))
+    in_head = np.stack([np.hypot(x, along), np.zeros_like(x), np.broadcast_to(z, x.shape)], axis=-1)
+    pixel = exact.intrinsics.project(transform(inverse(exact.T_head_camera), in_head.reshape(-1, 3)))
+    column, row = pixel.T.reshape(2, *x.shape)
+    # A shot has one bearing: that of its middle, whose rows are alike.
+    patches = Patches(column, row, np.full(x.shape, 0.01), np.arctan2(along, x)[:, 4])
+    flat = Segments(np.zeros(x.shape, np.intp), np.array([[-1.0, 0.0, 0.0, 2.0]]), 0.01)
+    (wall,), _ = walls_under(exact, patches, flat, [0], (0.01, CheckParams()))
+    assert wall.bow_m == pytest.approx(arc_m, rel=0.05)

@@ -120,12 +120,26 @@ def test_smeared_colour_beside_a_cut_core_is_no_halo(laser) -> None:
         column = rng.uniform(140.0, 156.0) + 0.002 * np.arange(320)
         bell = np.exp(-0.5 * ((np.arange(300.0) - column[:, None]) / rng.uniform(2.3, 3.4)) ** 2)[..., None]
         light = 255.0 * (over * bell * np.array(laser) + 0.05) + 2.0 * rng.standard_normal((320, 300, 3))
-        data = compressed(np.clip(np.rint(light), 0, 255).astype(np.uint8), 85, ("422", "420")[seed % 2])
-        line = find_laser_line(data, ALONE)
-        off = line.column_px - column
-        assert np.isfinite(off).mean() > 0.99
-        assert np.sqrt(np.nanmean(off**2)) < 0.05
-        assert np.nanmedian(line.sigma_px) < 0.05
+        for quality in (85, 76):
+            data = compressed(np.clip(np.rint(light), 0, 255).astype(np.uint8), quality, ("422", "420")[seed % 2])
+            line = find_laser_line(data, ALONE)
+            off = line.column_px - column
+            assert np.isfinite(off).mean() > 0.99
+            assert np.sqrt(np.nanmean(off**2)) < 0.05
+            assert np.nanpercentile(line.sigma_px, 90) < 0.06
+
+
+def test_what_other_channels_see_of_a_cut_core_counts_as_its_flanks() -> None:
+    """After a tone curve they see a third of it, all below saturation: without that part, 0.026 px."""
+    off = []
+    for seed in range(4):
+        for over in (1.3, 2.0):
+            rng, column = np.random.default_rng(seed), 150.0 + 0.29 * seed + 0.05 * np.arange(320)
+            bell = np.exp(-0.5 * ((np.arange(320.0) - column[:, None]) / 2.5) ** 2)[..., None]
+            light = (over * bell * np.array((0.015, 0.06, 1.0)) + 0.05) ** (1 / 2.2)
+            picture = np.clip(np.rint(255.0 * light + 1.5 * rng.standard_normal(light.shape)), 0, 255)
+            off.append(find_laser_line(compressed(picture.astype(np.uint8), 92), ALONE).column_px - column)
+    assert np.sqrt(np.nanmean(np.square(off))) < 0.0248
 
 
 @pytest.mark.parametrize(

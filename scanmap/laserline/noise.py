@@ -12,7 +12,8 @@ from scanmap.laserline.pictures import Rows
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_CORE_KEEPS = 0.5  # share of its variance that a core keeps when four parameters were fitted to it
+_CORE_TAKES = 2.3  # of the four parameters fitted to a profile, a core's samples determine
+_MEDIAN = 0.8  # of what pairs of rows scatter by, over its mean
 _MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
 _TELLING_PAIRS = 300
 _TELLING = 128  # rows that are enough to say so
@@ -104,11 +105,11 @@ def _speckle_contrasts(
         if usable.sum() < 20:
             contrasts.append(0.0)
             continue
-        # Four parameters were fitted to about as many samples of the core: it keeps half of its variance.
-        kept = 0.5 * scatter[of][usable] / count[of][usable] / _CORE_KEEPS
+        freedom = np.maximum(count[of][usable] - np.float32(_CORE_TAKES), np.float32(0.5))
+        kept = 0.5 * scatter[of][usable] / freedom
         excess = (kept - 1.5 * one_noise**2) / (power[of][usable] / count[of][usable])
         excess.partition(len(excess) // 2)
-        contrasts.append(float(np.sqrt(max(float(excess[len(excess) // 2]) / 0.8, 0.0))))
+        contrasts.append(float(np.sqrt(max(float(excess[len(excess) // 2]) / _MEDIAN, 0.0))))
     return contrasts
 
 
