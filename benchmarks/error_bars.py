@@ -4,8 +4,9 @@
 
 Frames of 320 rows drawn at random: quality 75 to 95, 4:4:4, 4:2:2 or 4:2:0, red or green laser, height 30 to 1000 grey
 levels (from about 240 they saturate), sigma 1 to 4 px, noise 1 to 6, half of them through a tone curve; a third of the
-lines upright, a third leaning by 0.002 to 0.03 columns a row, a third slanted by 0.08 to 0.3. z is the root mean square of error over sigma_px, each
-row by itself and pooled over nine; beside it z where the file's own rounding is kept from the detector.
+lines upright, a third leaning by 0.002 to 0.03 columns a row, a third slanted by 0.08 to 0.3. z is the root mean square
+of error over sigma_px, each row by itself and pooled over nine; beside it z where the file's own rounding is kept from
+the detector.
 """
 
 from __future__ import annotations

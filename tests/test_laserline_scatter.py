@@ -43,7 +43,7 @@ def test_half_a_beam_at_the_end_of_a_run_is_given_up(dimmed: float, given_up: bo
 
 
 def test_what_a_shaken_camera_leaves_grows_with_the_rooms_contrast() -> None:
-    """Both pictures differ by noise alone, but at an edge of 150 grey levels a twenty-fifth of it may be left besides."""
+    """Both pictures differ by noise alone; of an edge of 150 grey levels a twenty-fifth may be left besides."""
     # The difference of two pictures scatters by 2.1; by its median, a whole grey level, by 1.5.
     rng, column = np.random.default_rng(2), np.repeat([100.0, 200.0], 120)
     room = np.tile(np.select([np.arange(300) < 100, np.arange(300) < 200], [30.0, 60.0], 210.0), (240, 1))
