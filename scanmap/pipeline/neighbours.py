@@ -49,16 +49,12 @@ def neighbours_of(bearings: F64, range_m: F32, asked: Collection[int]) -> Neighb
     """Of bearings (B,) [rad] with ranges (B, H) [m]; those not `asked`, by their index, are nobody's."""
     turn = 2.0 * np.pi
     order = sorted(asked, key=lambda k: (bearings[k] % turn, bearings[k]))
-    at = np.array([bearings[k] % turn for k in order])
+    at = bearings[order] % turn
     beside: list[list[tuple[int, float]]] = [[] for _ in bearings]
-    for i, k in enumerate(order):
-        for way in (-1, 1):
-            for step in range(1, len(order)):
-                j = (i + way * step) % len(order)
-                away = float((way * (at[j] - at[i])) % turn)
-                if away > turn - _SAME or away < _SAME:
-                    continue
-                if away <= _FARTHEST:
-                    beside[k].append((order[j], away))
-                break
+    sides = (np.searchsorted(at, at - _SAME, "left") - 1, -1.0), (np.searchsorted(at, at + _SAME, "right"), 1.0)
+    for at_side, way in sides:
+        next_to = at_side % max(len(order), 1)
+        away = way * (at[next_to] - at) % turn
+        for i in np.flatnonzero((away >= _SAME) & (away <= _FARTHEST)):
+            beside[order[i]].append((order[next_to[i]], float(away[i])))
     return Neighbours(range_m.copy(), beside)

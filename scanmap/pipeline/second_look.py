@@ -99,7 +99,7 @@ class SecondLook:
                 scan.give_up(wrong, Reason.AMBIGUOUS)
             else:
                 self._look_again(scan, wrong, again, known, shots())
-            if known.neighbours is not None and not wrong.any():
+            if not views or (known.neighbours is not None and not wrong.any()):
                 break
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
         return total
