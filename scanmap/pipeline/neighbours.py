@@ -17,6 +17,7 @@ from scanmap.pipeline.still import SHARE
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
+Counts = NDArray[np.intp]
 
 _FARTHEST = float(np.radians(20.0))  # what lies farther round is no neighbour
 _SAME = float(np.radians(0.02))  # bearings closer than this are one
@@ -33,16 +34,21 @@ class Neighbours(NamedTuple):
     range_m: F32  # (B, H) NaN where there is no point
     beside: Sequence[Sequence[tuple[int, float]]]  # (B,) those next to each, and how far the head turns to them [rad]
 
-    def share(self, k: int, range_m: F32 | F64) -> F64:
-        """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""
-        goes_on, denied = np.zeros(len(range_m), np.intp), np.zeros(len(range_m), np.intp)
+    def tell(self, k: int, range_m: F32 | F64) -> tuple[Counts, Counts]:
+        """How many neighbours of bearing `k` go on points (H, ...) at some ranges [m], and how many lie elsewhere."""
+        goes_on, elsewhere = np.zeros(range_m.shape, np.intp), np.zeros(range_m.shape, np.intp)
         for other, turn in self.beside[k]:
-            theirs = self.range_m[other]
+            theirs = self.range_m[other].reshape(-1, *[1] * (range_m.ndim - 1))
             with np.errstate(invalid="ignore"):
                 near = np.abs(range_m - theirs) <= _STEEP * turn * np.minimum(range_m, theirs) + _SLACK_M
             goes_on += near
-            denied += np.isfinite(theirs) & ~near
-        return np.where(denied == 0, SHARE, np.where(goes_on > 0, _ONE_SIDE, _NEITHER))
+            elsewhere += np.isfinite(theirs) & ~near
+        return goes_on, elsewhere
+
+    def share(self, k: int, range_m: F32 | F64) -> F64:
+        """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""
+        goes_on, elsewhere = self.tell(k, range_m)
+        return np.where(elsewhere == 0, SHARE, np.where(goes_on > 0, _ONE_SIDE, _NEITHER))
 
 
 def neighbours_of(bearings: F64, range_m: F32, asked: Collection[int]) -> Neighbours:

@@ -23,6 +23,7 @@ from scanmap.pipeline.still import SHARE, StillThings
 from scanmap.scan import Scan
 from scanmap.scan.second_lines import Pictures
 from scanmap.shot import Shot
+from scanmap.triangulation import locate
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -30,10 +31,13 @@ U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Shots = Callable[[], Iterable[Shot]]
 
-_TURNS = 3  # after the first the neighbours are asked, of which the first made sense
+_TURNS = 3  # at first many of the neighbours are as wrong; after that they are asked
 _LOOKS = 3  # each may show what was hidden behind the last
 _LEAST_ROWS = 8  # of a picture that are worth another look
 _DIM, _UNCLIPPED = 0.0025, 200.0  # of the usual reflectance; grey levels up to which a height says how bright a line is
+# Share of points that were another thing's, from which on the line itself is looked for once more, in pictures that
+# have so many rows without a point though a place is listed where it should be.
+_HARD, _WORTH_ROWS = 0.01, 24
 _AROUND_PX = 8  # beside a line that is none, nothing is looked for
 _APART = float(np.radians(2.9))  # between pictures that are compared with others
 _SUSPECT = 2 / 3  # of the share that is asked of pictures, where they list what is like a line, to read them again
@@ -47,8 +51,10 @@ class _Known(NamedTuple):
     """What a sweep knows at one moment."""
 
     still: StillThings
-    neighbours: Neighbours | None
+    shown: bool  # whether that comes from all that the pictures show, or what was listed
+    neighbours: Neighbours | None  # None at first
     usual: float  # reflectance
+    choosing: bool = False  # whether only what goes on from the neighbours is wanted
 
     def share(self, k: int, range_m: F32 | F64) -> F64:
         """As `Neighbours.share` has it; the same for all while they are not known."""
@@ -86,22 +92,19 @@ class SecondLook:
         """
         asked = [k for k in range(len(scan)) if k not in without]
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
-        # At first, many of the neighbours are as wrong.
-        known, shown, total = _Known(self._listed(scan, views), None, self._usual()), False, 0
+        known, total = _Known(self._listed(scan, views), False, None, self._usual()), 0
         for _ in range(_TURNS):
             # Most scans of plain rooms need not be read again.
-            if shots is not None and not shown and self._suspected(scan, views, known):
-                known, shown = known._replace(still=self._shown(scan, views, shots())), True
+            if shots is not None and not known.shown and self._suspected(scan, views, known):
+                known = known._replace(still=self._shown(scan, views, shots()), shown=True)
             wrong = self._wrong(scan, asked, views, known)
             total += int(wrong.sum())
-            again = wrong.sum(axis=1) >= _LEAST_ROWS
-            if shots is None or not again.any():
-                scan.give_up(wrong, Reason.AMBIGUOUS)
-            else:
-                self._look_again(scan, wrong, again, known, shots())
+            self._look_again(scan, wrong, wrong.sum(axis=1) >= _LEAST_ROWS, known, shots)
             if not views or (known.neighbours is not None and not wrong.any()):
                 break
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
+        if known.shown and total >= _HARD * scan.valid.sum():
+            self._choose(scan, views, known._replace(choosing=True), shots)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
@@ -145,6 +148,22 @@ class SecondLook:
                 return np.zeros(scan.rows, bool)
         return known.still.line(float(scan.bearings[k]), column, self._ridge[k], part * share)
 
+    def _choose(self, scan: Scan, views: list[int], known: _Known, shots: Shots | None) -> None:
+        """Look again where the line is listed on the neighbours' course and something else was taken, or nothing."""
+        worth = np.zeros(len(scan), bool)
+        worth[views] = [self._choice(scan, k, known)[0].sum() >= _WORTH_ROWS for k in views]
+        self._look_again(scan, np.zeros_like(scan.valid), worth, known, shots)
+
+    def _choice(self, scan: Scan, k: int, known: _Known) -> tuple[Mask, list[F32]]:
+        """Rows (H,) without a point where the neighbours' course has a listed place, and columns (H,) listed off it."""
+        column = np.repeat(np.asarray(self._places[k], np.float64), 2 * BLOCK, axis=0)[: scan.rows]
+        row = np.repeat(np.arange(scan.rows, dtype=np.float64), column.shape[1])
+        points = locate(column.ravel(), row, self._pipeline.calibration, self._pipeline.triangulation)[0]
+        assert known.neighbours is not None
+        goes_on, elsewhere = known.neighbours.tell(k, np.sqrt((points**2).sum(axis=1)).reshape(column.shape))
+        off = np.where((goes_on == 0) & (elsewhere > 0), column, np.nan).astype(np.float32)
+        return ~scan.valid[k] & (goes_on > 0).any(axis=1), list(off.T)
+
     def _usual(self) -> float:
         known = np.concatenate(
             [values[np.isfinite(values)][::4] for values in self._reflectance] or [np.empty(0, np.float32)]
@@ -173,8 +192,11 @@ class SecondLook:
             still.add(float(scan.bearings[k]), np.repeat(ridges, 2, axis=0))
         return still
 
-    def _look_again(self, scan: Scan, wrong: Mask, again: Mask, known: _Known, shots: Iterable[Shot]) -> None:
+    def _look_again(self, scan: Scan, wrong: Mask, again: Mask, known: _Known, shots: Shots | None) -> None:
         """Give up the cells `wrong` (B, H), and fill those without a point of the pictures `again` (B,)."""
+        if shots is None or not again.any():
+            scan.give_up(wrong, Reason.AMBIGUOUS)
+            return
         places: dict[tuple[float, float], list[int]] = {}
         for k in map(int, np.flatnonzero(again)):
             places.setdefault(self._keys[k], []).append(k)
@@ -182,13 +204,14 @@ class SecondLook:
         scan.give_up(wrong, Reason.AMBIGUOUS)
 
         def wanted() -> Iterator[Shot]:
-            for shot in shots:
+            for shot in shots():
                 if (shot.time, shot.bearing) in places:
                     yield shot
 
         def look(shot: Shot) -> Step:
             k = places[shot.time, shot.bearing][0]
-            mask = np.any([self._around(column) for column in self._others[k]], axis=0)
+            others = self._others[k] + (self._choice(scan, k, known)[1] if known.choosing else [])
+            mask = np.any([self._around(column) for column in others], axis=0)
             ridges = self._pipeline.ridges(shot)
             if ridges is not None:
                 mask |= known.still.mask(shot.bearing, ridges)
@@ -223,7 +246,10 @@ def _other(step: Step, k: int, known: _Known, ridges: U8 | None) -> Mask:
     """Rows (H,) of a step, of a scan's bearing `k`, that are another thing's than the line."""
     line = step.line
     ridge = ridge_of(line.peak, line.width_px)
-    other = known.still.line(step.shot.bearing, line.column_px, ridge, known.share(k, step.profile.range_m))
+    share = known.share(k, step.profile.range_m)
+    other = known.still.line(step.shot.bearing, line.column_px, ridge, share)
+    if known.choosing:
+        other |= share < SHARE
     with np.errstate(invalid="ignore"):
         other |= _reflectance(step) < _DIM * known.usual
     return other if ridges is None else other | _hidden(line.column_px, ridge, ridges)
