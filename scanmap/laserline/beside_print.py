@@ -18,10 +18,11 @@ from scanmap.laserline.sight import Sight
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 _HALF = 13  # of the window [px]
 _MISFIT, _NOISE = 3.0, 1.5  # noises that a profile is no beam's from, and what noise is at least [grey levels]
-_FEW = 0.01  # share of a picture's rows that is let be
+_FEW, _SOME = 0.01, 0.03  # shares of a picture's rows that are let be: odd ones, and those that print could explain
 _TELLING, _WIDER = 40, 1.3  # lines that tell the usual width, and how much wider one may be
 _CORE = 2.0  # such widths beside the middle that say nothing of the room
 _SHOWN = 4.0  # noises that the other channel must explain beside the line
@@ -57,11 +58,12 @@ def apart_from_print(
     odd |= (reason == Reason.WIDE) | (reason == Reason.AMBIGUOUS)
     # Of a core that is cut the flanks tell, and its brightness.
     odd &= ~peaks.clipped
-    # A few rows of a picture are not worth it.
-    worth = np.bincount(rows.picture[odd], minlength=len(usual)) > _FEW * sight.height
+    worth = _worth(odd, rows, _FEW * sight.height)
     for k in np.flatnonzero(worth & np.isnan(usual)):
         own = peaks.width_px[rows.parts[k]][~odd[rows.parts[k]]]
-        usual[k] = np.median(own[:: 1 + len(own) // _TELLING]) if len(own) >= _TELLING else np.nan
+        if len(own) >= _TELLING:
+            own = np.sort(own[:: 1 + len(own) // _TELLING])
+            usual[k] = own[len(own) // 2]
     some = not_one(np.flatnonzero(odd & (worth & (usual > 0))[rows.picture]))
     if not some.size:
         return
@@ -71,7 +73,8 @@ def apart_from_print(
     beside = np.abs(np.arange(-_HALF, _HALF + 1))[:, None] > _CORE * _WIDER * usual[rows.picture[some]]
     slope, shown = _slope(other, own, usable * beside)
     # Of most rows the other channel shows nothing that could explain them.
-    tell = not_one(np.flatnonzero(slope * shown > np.float32(_SHOWN) * rows.noise[some]))
+    tells = slope * shown > np.float32(_SHOWN) * rows.noise[some]
+    tell = not_one(np.flatnonzero(tells & _worth(tells, rows.of(some), _SOME * sight.height)[rows.picture[some]]))
     if not tell.size:
         return
     own -= slope * other
@@ -87,6 +90,11 @@ def apart_from_print(
     for values, again in zip(peaks[:-1], found[:-1], strict=True):
         values[lines] = again[better]
     reason[lines] = Reason.OK
+
+
+def _worth(odd: Mask, rows: Rows, most: float) -> Mask:
+    """Pictures (P,) with more odd rows (N,) than are let be."""
+    return np.asarray(np.bincount(rows.picture[odd], minlength=len(rows.noise_of)) > most)
 
 
 def _slope(other: F32, own: F32, weight: F32) -> tuple[F32, F32]:
