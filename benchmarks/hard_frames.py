@@ -38,7 +38,7 @@ PANEL = 330  # [px] square
 SYNTHETIC = (
     ("stripes", False, "red and white stripes, no off frame"),
     ("red spines", False, "red spines as high as the line, no off frame"),
-    ("white text", True, "white text, with an off frame"),
+    ("white text", False, "white text, no off frame"),
     ("tube of light", False, "a tube of light, no off frame"),
     ("reflection", False, "a second reflection, no off frame"),
     ("saturated white", False, "a core saturated white, no off frame"),

@@ -46,6 +46,8 @@ _SIGMA_LEAST_PX = 0.003
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
 # Short runs of rows known no better than this are given up.
 _WEAK_PX = 0.2
+# So are shorter runs than these, with a laser-off frame and without: what one block of rows shows alone may be print.
+_FEWEST_ROWS = (4, BLOCK + 2)
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Share of its rows in which a picture must show the line to be thought of the laser's colour.
@@ -214,7 +216,8 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         line, weak = told_from_edges(line, weak, sight)
-    line = without(line, runs.crumbs(line.column_px, weak, height), Reason.AMBIGUOUS)
+    fewest = _FEWEST_ROWS[sight.off is None]
+    line = without(line, runs.crumbs(line.column_px, weak, height, fewest=fewest), Reason.AMBIGUOUS)
     line.column_px[:] += doubts.edges.shift
     return with_error_bars(line, sight, params.pool_rows, doubts)
 

@@ -148,10 +148,10 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array, rows: int) ->
     return mask
 
 
-def crumbs(column: Array, weak: Mask, rows: int, least: int = 12) -> Mask:
+def crumbs(column: Array, weak: Mask, rows: int, least: int = 12, fewest: int = 4) -> Mask:
     """Short runs of rows (P H,), of pictures of `rows` rows, that no neighbour on either side continues.
 
-    Of 3 rows always, and of fewer than `least` if most are `weak` (P H,).
+    Of fewer than `fewest` always, and of fewer than `least` if most are `weak` (P H,).
     """
     mask = np.zeros(len(column), bool)
     found = np.isfinite(column).nonzero()[0]
@@ -160,5 +160,5 @@ def crumbs(column: Array, weak: Mask, rows: int, least: int = 12) -> Mask:
     number = numbered(found, column[found], GAP_ROWS + 1, rows)
     length = np.bincount(number)
     doubtful = np.bincount(number, weak[found]) > 0.5 * length
-    mask[found[((length < 4) | (doubtful & (length < least)))[number]]] = True
+    mask[found[((length < fewest) | (doubtful & (length < least)))[number]]] = True
     return mask
