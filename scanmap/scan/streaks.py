@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 _BEFORE_M = 0.05  # of a mirror, at least, is a surface that light falls on by it
 _APART_M = 0.1  # a place nearer than this to a point is the point
 _LEVEL, _FLAT_M = 0.97, 0.03  # cosine of what faces up or down; how flat a floor is
-_LEAST_CELLS, _LEVEL_SHARE = 60, 0.15  # that face so, and share of them in one level
+_LEAST_CELLS, _LEVEL_SHARE = 60, 0.05  # that face so, and share of them in one level
 _GAP, _STEP_PX, _SHARE = (
     3,
     1.5,
