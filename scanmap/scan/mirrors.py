@@ -2,7 +2,7 @@
 
 A laser plane that a plane mirror turns away, seen through the same mirror, is measured without any error where the
 mirror's image of the room is: behind the mirror's plane, in one piece over the bearings. Colour, width and range are
-those of a line. Three things tell it from a room behind an opening, and all three must speak:
+those of a line. Three things tell it from a room behind an opening:
 
 - The opening is cut sharply. Through a door the floor runs on, and the reveal of a wall shows its thickness; beside a
   mirror the range jumps from the frame straight into the image.
@@ -11,7 +11,9 @@ those of a line. Three things tell it from a room behind an opening, and all thr
 - Nothing denies it: no point hangs in the air once reflected, where the scan looked through, and nothing of the room is
   missing where the mirror must show it.
 
-What the scan did not see, behind furniture or in the half that was not swept, says nothing either way.
+What the scan did not see, behind furniture or in the half that was not swept, says nothing either way. Where nothing
+compares, the cut alone is enough if upper and lower ends are seen all along: a wall is as thick as it is. And pictures
+prove mirrors whose ends are out of view (`second_lines`).
 """
 
 from __future__ import annotations
@@ -45,7 +47,6 @@ _AS_HIGH = 0.6  # share of the cells of other bearings, where none tells
 _TELLING = 0.2  # cosine of the angle between a surface that tells and the mirror
 _AROUND = np.ones((3, 5), np.uint8)  # columns x rows by which a mirror may be larger than what is seen in it
 _FEW = 0.02  # share of all patches that may deny where nothing compares
-_DEEP_M, _DEEP_SHARE = 1.0, 0.95  # so far behind the wall is nearly all that is seen in a mirror and nothing compares
 _NARROW_M = 0.2  # a surface is wide where the points at the bearings beside are no more than this nearer or farther
 
 
@@ -98,9 +99,8 @@ def _likely(seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
     offset, agree, deny = _likeness(seen, opening.cells, wall)
     patches = len(np.unique(_patches(points)))
     alike = agree >= max(_PATCHES, _SUPPORT * patches) and agree >= _AGREE * (agree + deny)
-    # A wall is not cut without showing how thick it is; what is thinner is a piece of furniture, and not so deep.
-    deep = np.quantile(points @ wall[:3] + wall[3], 1.0 - _DEEP_SHARE) < -_DEEP_M
-    if alike or (opening.framed and deny <= _FEW * patches and deep):
+    # No wall is cut without showing how thick it is; and what is shallow hangs in the air once reflected.
+    if alike or (opening.framed and deny <= _FEW * patches):
         return Mirror(wall - [0.0, 0.0, 0.0, offset], opening.cells, agree, deny)
     return None
 
