@@ -4,9 +4,9 @@ Run: python benchmarks/mirrors.py [--step DEG] [--turn DEG] [--rooms N] [--plot 
 
 No pictures are rendered: rays of the laser's fan are traced to the room, straight and by each mirror, and from there
 to the camera, straight and by the mirror; in every image row the brightest line wins, and what reflects less than any
-surface is left out, as the second look does. All lines in the window are listed, as the pictures would. Printed are the shares of points more than 10 cm off any surface by the
-path they came on, what is left of them, and what was lost of true points. --plot draws every room from above: grey what
-stays, red what was given up.
+surface is left out, as the second look does. All lines in the window are listed, as pictures list them. Printed are the
+shares of points more than 10 cm off any surface by the path they came on, what is left of them, and what was lost of
+true points. --plot draws every room from above: grey what stays, red what was given up.
 """
 
 from __future__ import annotations
