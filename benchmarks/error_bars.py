@@ -58,9 +58,10 @@ def measured(rng: np.random.Generator) -> Frame:
         line = find_laser_line(image, LaserLineParams(pool_rows=rows), rounding=told)
         off = line.column_px - column
         # Rows that were not found at all are another matter.
-        off[np.abs(off) > 1.0 + 6.0 * line.sigma_px] = np.nan
-        frame[name] = float(np.nanmean(np.square(off / line.sigma_px)))
-        frame[f"{name} px"] = float(np.nanmean(np.square(off)))
+        known = np.abs(off) <= 1.0 + 6.0 * line.sigma_px
+        off, sigma = (off[known], line.sigma_px[known]) if known.any() else (np.full(1, np.nan), np.ones(1))
+        frame[name] = float(np.mean(np.square(off / sigma)))
+        frame[f"{name} px"] = float(np.mean(np.square(off)))
     return frame
 
 
@@ -85,7 +86,7 @@ def row(line: str, label: str, frames: list[Frame], chosen: Callable[[Frame], bo
     """Print one line of the table."""
     some = [frame for frame in frames if frame["line"] == line and chosen(frame)]
     z = {
-        name: float(np.sqrt(np.mean([float(frame[name]) for frame in some])))
+        name: float(np.sqrt(np.nanmean([float(frame[name]) for frame in some])))
         for name in ("alone", "alone px", "pooled", "pooled px", "blind", "both")
     }
     print(f"{line:8s} {label:20s} {len(some):5d} | {z['alone']:6.2f} {z['alone px']:8.4f} | {z['pooled']:6.2f} "
