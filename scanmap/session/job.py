@@ -35,8 +35,8 @@ from scanmap.view import View
 from scanmap.view.viewer import has_display
 
 # While a scan runs the viewer's map is made anew this often [shots].
-MOST_EXPECTED = 4096  # bearings that room is made for beforehand, whatever a recording says it holds
 MAP_EVERY = 20
+MOST_EXPECTED = 4096  # bearings that room is made for beforehand, whatever a recording says it holds
 
 
 @dataclass(frozen=True)
@@ -311,11 +311,7 @@ def is_scan_file(path: Path) -> bool:
 
 
 def finished_scan(scan: Scan, config: Config, pictures: Pictures | None = None) -> Scan:
-    """Passes merged, sorted by bearing, outliers and what was seen in mirrors removed.
-
-    Args:
-        pictures: what they show beside the line, which proves more mirrors.
-    """
+    """Passes merged, sorted by bearing, outliers and what was seen in mirrors removed, more of it with `pictures`."""
     finished = scan.merged(config.scan.merge_deg)
     if config.scan.filter_outliers:
         finished = remove_outliers(finished, config.scan)
