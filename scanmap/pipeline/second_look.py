@@ -94,10 +94,11 @@ class SecondLook:
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
         known, total = _Known(self._listed(scan, views), False, None, self._usual()), 0
         for _ in range(_TURNS):
-            # Most scans of plain rooms need not be read again.
-            if shots is not None and not known.shown and self._suspected(scan, views, known):
+            # Most scans of plain rooms need not be read again, nor asked more.
+            suspect = shots is None or known.shown or self._suspected(scan, views, known)
+            if shots is not None and suspect and not known.shown:
                 known = known._replace(still=self._shown(scan, views, shots()), shown=True)
-            wrong = self._wrong(scan, asked, views, known)
+            wrong = self._wrong(scan, asked, views if suspect else [], known)
             total += int(wrong.sum())
             self._look_again(scan, wrong, wrong.sum(axis=1) >= _LEAST_ROWS, known, shots)
             if not views or (known.neighbours is not None and not wrong.any()):
