@@ -107,7 +107,7 @@ def _speckle_contrasts(
             continue
         freedom = np.maximum(count[of][usable] - np.float32(_CORE_TAKES), np.float32(0.5))
         kept = 0.5 * scatter[of][usable] / freedom
-        excess = (kept - 1.5 * one_noise**2) / (power[of][usable] / count[of][usable])
+        excess = (kept - 1.5 * one_noise**2) / np.maximum(power[of][usable] / count[of][usable], np.float32(1e-6))
         excess.partition(len(excess) // 2)
         contrasts.append(float(np.sqrt(max(float(excess[len(excess) // 2]) / _MEDIAN, 0.0))))
     return contrasts
