@@ -3,7 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from synthetic_lines import HARD, RED, Room, hard_frame, line_light, score, sensor
+from synthetic_lines import GREEN, HARD, RED, Room, hard_frame, line_light, score, sensor
+from test_laserline_compressed import compressed
+from test_laserline_rounding import drawn
 
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
 
@@ -87,3 +89,17 @@ def test_white_print_under_the_line(colour, least, most_false):
     found, false = np.mean(scores, axis=0)
     assert found >= least
     assert false <= most_false
+
+
+@pytest.mark.parametrize("tone", [False, True])
+@pytest.mark.parametrize("laser", [RED, GREEN], ids=["red", "green"])
+def test_a_saturated_line_of_any_width_is_no_faulty_column(laser, tone):
+    """Upright, its flanks lie four columns or so from the middle in all rows alike."""
+    rng, shapes = np.random.default_rng(3), [(sigma, peak) for sigma in (1.4, 1.6, 2.2, 3.6) for peak in (650.0, 950.0)]
+    found = []
+    for sigma, peak in shapes:
+        for u in (0.0, 0.15, 0.5, 0.75):
+            pixels = drawn(rng, np.full(48, 139.0 + u), peak, sigma, 1.2, laser, tone)
+            line = find_laser_line(compressed(pixels, 88, "444"), GAUSS)
+            found.append(np.mean(np.abs(line.column_px - 139.0 - u) < 0.5))
+    assert min(found) >= 0.95
