@@ -81,8 +81,10 @@ def decode_image(data: bytes, *, grey: bool = False, into: Image | None = None) 
     refusal = f"image cannot be decoded: {len(data)} bytes, neither a whole JPEG nor PNG"
     if not data or (kind == "png" and not _is_whole_png(data)):
         raise CameraError(refusal)
+    # As the sensor reads it: a phone's mark that the picture stands on its side is heeded in no format.
+    mode = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error as error:  # larger than OpenCV takes
         raise CameraError(refusal) from error
     if pixels is None:

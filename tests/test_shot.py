@@ -1,5 +1,8 @@
 """Encoded images opened: whole, cut short and damaged."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 import simplejpeg
@@ -26,6 +29,21 @@ def test_of_a_cut_jpeg_no_row_is_believed_that_the_whole_one_does_not_have(sampl
     # Of what is right no more than two blocks are given up.
     assert all(right - rows <= 32 for rows, right in believed)
     assert max(rows for rows, _ in believed) > 180
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png"])
+def test_a_mark_that_the_picture_stands_on_its_side_turns_no_pixel(kind):
+    """A calibration is of the sensor's rows and columns, and OpenCV would turn a PNG and simplejpeg no JPEG."""
+    image = np.repeat(np.arange(0, 240, 5, dtype=np.uint8), 64).reshape(48, 64)
+    turned = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x112, 3, 1, 6, 0)
+    if kind == "png":
+        data, chunk = encode_png(image), b"eXIf" + turned
+        marked = data[:33] + struct.pack(">I", len(turned)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    else:
+        data, chunk = simplejpeg.encode_jpeg(image[:, :, None], 90, "GRAY"), b"Exif\0\0" + turned
+        marked = data[:2] + b"\xff\xe1" + struct.pack(">H", len(chunk) + 2) + chunk + data[2:]
+    assert marked != data
+    np.testing.assert_array_equal(decode_image(marked).image, decode_image(data).image)
 
 
 def test_what_is_no_picture_is_refused():
