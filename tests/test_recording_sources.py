@@ -53,6 +53,33 @@ def test_a_folder_of_frames_by_name_and_by_number(tmp_path: Path) -> None:
     assert (describe(folder).kind, describe(folder).shots, describe(folder).has_calibration) == ("frames", 4, True)
 
 
+SPREADSHEETS = {
+    "semicolon and decimal comma": "frame;bearing_deg;time_s\r\na,1.jpg;22,5;0,25\r\n",
+    "tab": "frame\tbearing_deg\ttime_s\na,1.jpg\t22.5\t0,25\n",
+    "quotes": 'time_s,note,bearing_deg,frame\n0.25,"x;y;z",22.5,"a,1.jpg"\n',
+    "with the folder": 'frame,bearing_deg,time_s\n"frames/a,1.jpg",22.5,0.25\n',
+}
+
+
+@pytest.mark.parametrize("kind", SPREADSHEETS)
+def test_a_csv_may_be_written_as_spreadsheets_write_it(tmp_path: Path, kind: str) -> None:
+    folder = write_folder(tmp_path / "scan", SPREADSHEETS[kind], ["a,1.jpg"], off=("a,1.jpg",))
+    (shot,) = open_source(folder).shots()
+    assert (shot.bearing, shot.time) == (np.radians(22.5), 0.25)
+    assert (shot.image, shot.background) == (b"on a,1.jpg", b"off a,1.jpg")
+
+
+def test_scans_side_by_side_in_a_folder_are_not_taken_for_one(tmp_path: Path) -> None:
+    record(tmp_path / "hall.mcap", made_up_shots(3))
+    record(tmp_path / "room.mcap", made_up_shots(4), start_ns=START_NS + 1)
+    for reader in (open_source, describe):
+        with pytest.raises(RecordingError, match=r"2 scans: .*hall\.mcap, .*room\.mcap; name one"):
+            reader(tmp_path)
+    record(tmp_path / "room.part2.mcap", made_up_shots(2), start_ns=START_NS + 1)
+    (tmp_path / "hall.mcap").unlink()
+    assert (open_source(tmp_path).count, describe(tmp_path).shots) == (6, 6)
+
+
 def test_a_missing_image_costs_its_own_shot(tmp_path: Path) -> None:
     csv = "frame,bearing_deg,time_s\na.jpg,0,0\nb.jpg,1,1\nc.jpg,2,2\n"
     source = open_source(write_folder(tmp_path / "scan", csv, ["a.jpg", "c.jpg"]))
@@ -84,6 +111,7 @@ def test_an_unreadable_image_costs_its_own_shot(tmp_path: Path) -> None:
         ("frame,bearing_deg,time_s\na.jpg\n", "line 2: bearing_deg is ''.*line 2: time_s is ''"),
         ("frame,bearing_deg,time_s\na.jpg,1,soon\n", "line 2: time_s is 'soon'"),
         ("frame,bearing_deg,time_s\n,1,1\n", "line 2: frame is empty"),
+        ("frame,bearing_deg,bearing_deg\na.jpg,1,2\n", "column bearing_deg twice"),
         ("frame,bearing_deg,time_s\n../../secret,1,1\n", "is no name of a file in the folder"),
         ("frame,bearing_deg,time_s\n" + "a.jpg,x,1\n" * 9, "and 4 more"),
     ],
@@ -98,7 +126,7 @@ def test_a_faulty_csv_is_told_in_one_line_with_line_and_value(tmp_path: Path, cs
 def test_a_csv_that_is_no_text_is_told(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "scan", "", ["a.jpg"])
     (folder / "scan.csv").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(ConfigError, match="is no csv"):
+    with pytest.raises(ConfigError, match="is no csv: it is not text in UTF-8; save it"):
         open_source(folder)
 
 

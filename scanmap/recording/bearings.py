@@ -1,4 +1,7 @@
-"""The csv beside images: which frame was taken at which bearing."""
+"""The csv beside images: which frame was taken at which bearing.
+
+Spreadsheets of half the world separate by `;` and write a decimal comma, so both are read.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,8 @@ class Row(NamedTuple):
 def read_bearings(path: Path, *, frame_optional: bool = False) -> list[Row]:
     """Read a csv with the header `frame,bearing_deg,time_s`; `time_s` may be left out.
 
+    Cells stand between `,`, `;` or tabs, as the header has most of; a decimal comma is read.
+
     Args:
         path: the csv.
         frame_optional: without a `frame` column, lines are frames 0, 1, 2 ...; then the header may be missing
@@ -46,6 +51,9 @@ def read_bearings(path: Path, *, frame_optional: bool = False) -> list[Row]:
         raise ConfigError(
             f"{path} lacks the column {' and '.join(missing)}: it has {_printed(columns)}; it needs {HEADER}"
         )
+    twice = [name for name in ("frame", "bearing_deg", "time_s") if columns.count(name) > 1]
+    if twice:
+        raise ConfigError(f"{path} has the column {twice[0]} twice: {_printed(columns)}; leave one of them")
     faults: list[str] = []
     rows = list(_rows(lines[1:], columns, faults))
     if faults:
@@ -64,11 +72,15 @@ def frame_number(frame: str) -> int | None:
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
+            separator = max(",;\t", key=file.readline().count)
+            file.seek(0)
+            reader = csv.reader(file, delimiter=separator, strict=True)
             return [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is no csv: it is not text in UTF-8; save it as a csv with {HEADER}") from error
+    except csv.Error as error:
         raise ConfigError(f"{path} is no csv: {error}") from error
 
 
@@ -94,7 +106,7 @@ def _printed(columns: list[str]) -> str:
 
 def _number(text: str) -> float | None:
     try:
-        value = float(text)
+        value = float(text.replace(",", "."))
     except ValueError:
         return None
     return value if math.isfinite(value) else None

@@ -18,7 +18,7 @@ def frames_source(folder: Path) -> Source:
     """Open a folder of frames.
 
     `scan.csv` has the header `frame,bearing_deg,time_s`; a frame is the name of a file in `frames/`, or a
-    number N for `frames/00000N.jpg` (or .png). The file of the same name in `off/`, if there is one, is the
+    number N for `frames/00000N.jpg` (or .png); `frames/` before the name may stand or not. The file of the same name in `off/`, if there is one, is the
     picture with the laser off. `calibration.toml` and `rig.toml` in the folder come along.
 
     Raises:
@@ -59,12 +59,15 @@ def _read(folder: Path, rows: list[Row], report: Report) -> Iterator[Shot]:
         done += 1
         yield Shot(index, row.bearing, row.bearing, time, image, background)
     if not done:
-        raise RecordingError(f"none of the {len(rows)} images that {folder / 'scan.csv'} names is in {frames}")
+        raise RecordingError(
+            f"none of the {len(rows)} images that {folder / 'scan.csv'} names is in {frames}, beginning with "
+            f"{rows[0].frame}; correct the names, or move the images there"
+        )
 
 
 def _bytes(folder: Path, row: Row, report: Report) -> bytes | None:
     """The file of a row; a missing or unreadable one is reported."""
-    names = [row.frame]
+    names = [row.frame.removeprefix("frames/")]
     if (number := frame_number(row.frame)) is not None:
         names += [f"{number:06d}{suffix}" for suffix in SUFFIXES]
     path = next((folder / name for name in names if _is_file(folder / name)), None)

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from scanmap.recording import layout
 from scanmap.recording.layout import RecordingParams
-from scanmap.recording.mcap_reader import bag_parts
 from scanmap.recording.messages import SECOND_NS, Fault
 from scanmap.recording.opening import open_source
 from scanmap.recording.outline import Outline, outline
@@ -89,8 +88,7 @@ def describe(path: Path | str, params: RecordingParams | None = None) -> Recordi
         return _describe_parts(path, part_outlines(path), params)
     source = open_source(path, params)
     if source.kind == "recording":
-        parts = bag_parts(path) if path.is_dir() else [path]
-        return _describe_parts(path, [outline(part) for part in parts], params)
+        return _describe_parts(path, [outline(part) for part in source.parts], params)
     return RecordingInfo(
         path,
         source.kind,

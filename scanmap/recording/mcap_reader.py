@@ -13,7 +13,7 @@ from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_records import Break, Channel, DamagedError, Directory, Message, Record
 from scanmap.recording.messages import MalformedMessageError
 from scanmap.recording.outline import Outline, outline
-from scanmap.recording.parts import part_outlines
+from scanmap.recording.parts import part_outlines, start_of
 from scanmap.recording.source import Report, Source
 from scanmap.recording.withdrawals import Withdrawals, left_out, withdrawals
 from scanmap.shot import Shot
@@ -25,7 +25,7 @@ def mcap_source(path: Path, params: RecordingParams) -> Source:
     Raises:
         RecordingError: not an MCAP file, unreadable, or without the topics that make shots.
     """
-    outlines = [outline(part) for part in bag_parts(path)] if path.is_dir() else part_outlines(path)
+    outlines = _of_folder(path) if path.is_dir() else part_outlines(path)
     for found in outlines:
         _require_topics(found, params)
     first, last = outlines[0], outlines[-1]
@@ -48,7 +48,20 @@ def mcap_source(path: Path, params: RecordingParams) -> Source:
     )
 
 
-def bag_parts(folder: Path) -> list[Path]:
+def _of_folder(folder: Path) -> list[Outline]:
+    """The files of a bag or of one scan; RecordingError where scans of different starts lie side by side."""
+    found = [outline(part) for part in _bag_parts(folder)]
+    starts: dict[str, Path] = {}
+    for each in found:
+        starts.setdefault(start_of(each), each.path)
+    starts.pop("", None)
+    if len(starts) > 1:
+        names = ", ".join(str(path) for path in list(starts.values())[:4])
+        raise RecordingError(f"folder {folder} holds {len(starts)} scans: {names}; name one of these instead")
+    return found
+
+
+def _bag_parts(folder: Path) -> list[Path]:
     """The .mcap files of a ROS 2 bag folder, in order.
 
     Raises:

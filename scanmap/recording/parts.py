@@ -54,7 +54,7 @@ def part_outlines(path: Path) -> list[Outline]:
         except RecordingError as error:
             first.faults.append(f"{error}; it is left out")
             continue
-        begun, theirs = _start(first), _start(other)
+        begun, theirs = start_of(first), start_of(other)
         if begun and theirs and begun != theirs:
             first.faults.append(f"{part} continues another scan than {path} and is left out")
         elif other.directory.channels:
@@ -64,6 +64,6 @@ def part_outlines(path: Path) -> list[Outline]:
     raise AssertionError("unreachable")
 
 
-def _start(found: Outline) -> str:
+def start_of(found: Outline) -> str:
     """What names a scan: the nanosecond it began in; empty where that is not known."""
     return found.metadata.get(layout.START_METADATA, {}).get("start_ns", "")
