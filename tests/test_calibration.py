@@ -220,8 +220,14 @@ def test_an_unreadable_file_is_one_clear_error(tmp_path):
 def test_images_of_another_size_are_refused():
     head = Calibration.loads(EXAMPLE)
     head.check_image(1600, 1200)
-    with pytest.raises(CalibrationError, match="image is 640x480, the calibration is for 1600x1200"):
+    with pytest.raises(CalibrationError, match=r"image is 640x480, the calibration is for 1600x1200.* --size 640x480"):
         head.check_image(640, 480)
+    with pytest.raises(CalibrationError, match="turn them by 90 deg"):
+        head.check_image(1200, 1600)
+    for width, height in ((1200, 1600), (1280, 720)):
+        with pytest.raises(CalibrationError, match=f"image is {width}x{height}") as caught:
+            head.check_image(width, height)
+        assert "scale" not in str(caught.value)  # which would refuse another aspect
 
 
 @given(calibration=calibrations(), scale=st.sampled_from([0.25, 0.5, 2.0]), x=st.floats(0, 1), y=st.floats(0, 1))

@@ -88,7 +88,7 @@ class Calibration:
             CalibrationError: another aspect cannot show the same field of view.
         """
         own = self.intrinsics
-        if abs(width * own.height - height * own.width) > 0.5 * max(own.width, own.height):
+        if not self._same_aspect(width, height):
             raise CalibrationError(
                 f"{width}x{height} has another aspect than the calibration's {own.width}x{own.height}: it cannot show "
                 "the same field of view; calibrate the camera at that size"
@@ -108,12 +108,22 @@ class Calibration:
     def check_image(self, width: int, height: int) -> None:
         """Raise CalibrationError unless images of this size belong to this calibration."""
         own = self.intrinsics
-        if (width, height) != (own.width, own.height):
-            raise CalibrationError(
-                f"image is {width}x{height}, the calibration is for {own.width}x{own.height}; "
-                f"set the camera to {own.width}x{own.height}, give the calibration of these images "
-                f"with --calibration, or make it: scanmap calibrate scale F.toml --size {width}x{height} --out G.toml"
-            )
+        if (width, height) == (own.width, own.height):
+            return
+        if self._same_aspect(width, height):
+            last = f", or make it: scanmap calibrate scale F.toml --size {width}x{height} --out G.toml"
+        elif (height, width) == (own.width, own.height):
+            last = "; these stand on their side, so turn them by 90 deg (a mark in the file that says so is not heeded)"
+        else:
+            last = ""
+        raise CalibrationError(
+            f"image is {width}x{height}, the calibration is for {own.width}x{own.height}; set the camera to "
+            f"{own.width}x{own.height}, or give the calibration of these images with --calibration{last}"
+        )
+
+    def _same_aspect(self, width: int, height: int) -> bool:
+        own = self.intrinsics
+        return abs(width * own.height - height * own.width) <= 0.5 * max(own.width, own.height)
 
     @classmethod
     def load(cls, path: Path | str) -> Calibration:

@@ -17,9 +17,9 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 def frames_source(folder: Path) -> Source:
     """Open a folder of frames.
 
-    `scan.csv` has the header `frame,bearing_deg,time_s`; a frame is the name of a file in `frames/`, or a
-    number N for `frames/00000N.jpg` (or .png); `frames/` before the name may stand or not. The file of the same name in `off/`, if there is one, is the
-    picture with the laser off. `calibration.toml` and `rig.toml` in the folder come along.
+    `scan.csv` has the header `frame,bearing_deg,time_s`; a frame is the name of a file in `frames/`, which may
+    stand before it, or a number N for `frames/00000N.jpg` (or .png). The file of the same name in `off/`, if there
+    is one, is the picture with the laser off. `calibration.toml` and `rig.toml` in the folder come along.
 
     Raises:
         RecordingError: the folder is empty or has no scan.csv, or a file cannot be read.

@@ -84,7 +84,7 @@ def _describe_toml(path: Path) -> list[str]:
     if "image" in document or "head" in document:
         return _describe_calibration(path)
     config = configuration.load(str(path))
-    head = "inline" if not isinstance(config.calibration, str | None) else config.calibration or "the recording's own"
+    head = "inline" if not isinstance(config.calibration, str | None) else config.calibration or "none of its own"
     return [
         f"rig {path}: {config.description or 'without a description'}",
         f"rig = {config.rig}; calibration: {head}",
