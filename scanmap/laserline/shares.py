@@ -77,10 +77,9 @@ def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = Fals
         for near, side in ((slice(half - 3, half), half - 4), (slice(half + 1, half + 4), half + 4))
     ]
     dark = np.maximum(own[half - 4], own[half + 4]) < COLOURLESS - 3 * _FLANK
-    # And a saturated line whose flanks are farther out shows them there.
-    dark &= (
-        np.maximum(own[half - 4] - own[sides[0]].min(axis=0), own[half + 4] - own[sides[1]].min(axis=0)) < 3 * _FLANK
-    )
+    # And a saturated line whose flanks are farther out shows them there, on both sides.
+    falls = np.minimum(own[half - 4] - own[half - 7], own[half + 4] - own[half + 7])
+    dark &= falls < 2 * _FLANK
     fault = bare[0] & bare[1] & dark & (own[half - 1 : half + 2].max(axis=0) >= COLOURLESS)
     light = y[left, :, index] + y[right, :, index]
     near = 1.0 - light[:, others].max(axis=1) / np.maximum(light[:, channel], 1.0)
