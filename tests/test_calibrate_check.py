@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room_lines import head, off_by, room_lines
+from room_lines import head, off_by, room_lines, turntable_lines
 from test_calibrate_self import run, twin_recording
 
 from scanmap.calibration import Calibration
@@ -36,6 +36,15 @@ def test_a_wrong_head_fails_and_is_told_by_how_much(beta: float, offset: tuple[f
     assert not judged.passed and judged.contradictions
     said = " ".join(line for passed, line in verdict_lines(judged) if not passed)
     assert ("yaw by +0.2" if beta else "offset_y by -2") in said.replace("+0.19", "+0.2").replace("-19.", "-20.")
+
+
+def test_a_line_that_stands_still_says_the_same_at_every_bearing() -> None:
+    """A level plate turns under a line that does not move: all its shots weigh as much as one."""
+    true = head(480, HeadMount((-0.42, 0.0, 0.0)))
+    judged = check(turntable_lines(0.02, true.mount), true)
+    plate = max(judged.walls, key=lambda wall: wall.bearings)
+    assert plate.bearings == 90 and plate.places < 30
+    assert min(wall.places for wall in judged.walls if wall is not plate) > 150
 
 
 @pytest.mark.slow

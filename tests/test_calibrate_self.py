@@ -17,9 +17,23 @@ from scanmap.config import load
 from scanmap.errors import CalibrationError
 from scanmap.geometry import HeadMount, fit_plane, rotation_z
 from scanmap.session.judging import measure_lines
+from scanmap.solvers.flat_segments import beside
 from scanmap.solvers.freedom import changed, redrawn
 from scanmap.solvers.self_calibration import Refined, refine
 from scanmap.solvers.sight import Lines, located, patches_of, sight_of
+
+
+def test_columns_beside_a_plane_are_the_same_of_a_room_and_of_its_model() -> None:
+    """All lengths a hundredth: the picture is the same. A floor in metres rewarded heads that shrink what they see."""
+    rng = np.random.default_rng(5)
+    points, per_column = rng.normal(0.0, 2.0, (2, 50, 3))
+    normal = np.array([0.36, -0.48, 0.8])
+    room = beside(points, 0.01 * per_column, np.append(normal, 1.5))
+    model = beside(0.01 * points, 1e-4 * per_column, np.append(normal, 0.015))
+    assert model == pytest.approx(room, rel=1e-9)
+    along = 0.01 * per_column @ normal
+    steep = np.abs(along) > 0.05 * 0.01 * np.linalg.norm(per_column, axis=1)
+    assert steep.sum() > 40 and room[steep] == pytest.approx(((points @ normal + 1.5) / along)[steep])
 
 
 def errors(refined: Refined, exact: Calibration) -> tuple[float, np.ndarray, np.ndarray]:

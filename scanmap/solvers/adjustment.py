@@ -21,7 +21,7 @@ from scanmap.calibration import Calibration
 from scanmap.solvers.flat_segments import Segments
 from scanmap.solvers.freedom import Freedom
 from scanmap.solvers.own_planes import Pieces, azimuth_influence, beside_own_planes, leans
-from scanmap.solvers.sight import Patches, Sight, located
+from scanmap.solvers.sight import Patches, Sight, located, places_of
 from scanmap.solvers.squareness import Upright
 
 Array = NDArray[np.float64]
@@ -31,7 +31,6 @@ LARGEST_SOLVE = 15_000  # patches; more of one shot and wall say the same again
 FEWEST_PATCHES = 15  # that a piece must have left
 NOISE_FLOOR_PX = 0.003  # of what all patches of one shot on one wall may have in common
 TYPICAL_SHOTS = 8  # shots on a piece from which on it tells its own noise
-SAME_COLUMN_PX = 1.0  # a line that stands this close is off alike
 # Walls stand upright and floors lie level to each other by so much [rad]; asked of the largest pieces only.
 PLUMB = np.radians(0.5)
 UPRIGHT_WITHIN = np.radians(12.0)
@@ -87,8 +86,8 @@ class Adjustment:
     """The patches of one round, sorted by the piece they lie on."""
 
     sight: Sight  # N patches
-    column: Index  # (N,) in steps of SAME_COLUMN_PX
-    place: Index  # (N,) the same of the same row
+    column: Index  # (N,) where in the picture the line stands
+    place: Index  # (N,) and in which row
     pieces: Pieces
     cluster: Index  # (N,) one shot on one piece
     walls: Index  # large pieces that stand upright
@@ -110,8 +109,9 @@ class Adjustment:
         where = where[np.argsort(label[where], kind="stable")]
         numbers, piece = np.unique(label[where], return_inverse=True)
         _, cluster = np.unique(piece * segments.label.shape[0] + where // segments.label.shape[1], return_inverse=True)
-        _, column = np.unique(np.round(patches.column_px.ravel()[where] / SAME_COLUMN_PX), return_inverse=True)
-        _, place = np.unique(column * segments.label.shape[1] + where % segments.label.shape[1], return_inverse=True)
+        standing = places_of(patches).ravel()[where]
+        _, column = np.unique(standing // segments.label.shape[1], return_inverse=True)
+        _, place = np.unique(standing, return_inverse=True)
         pieces = Pieces(piece, np.searchsorted(piece, np.arange(len(numbers))), segments.planes[numbers, :3])
         large = np.argsort(-np.bincount(piece))[:LARGEST_PIECES]
         lean = np.abs(pieces.normals[large, 2])

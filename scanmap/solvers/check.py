@@ -58,9 +58,9 @@ class Check:
 
     @property
     def strain(self) -> float:
-        """Median over the walls' patches: one wall that really is bent does not condemn a calibration."""
+        """Median over what is seen of the walls: one that really is bent does not condemn a calibration."""
         order = np.argsort([wall.strain for wall in self.walls])
-        share = np.cumsum([self.walls[k].patches for k in order], dtype=float)
+        share = np.cumsum([self.walls[k].places for k in order], dtype=float)
         return float(self.walls[order[int(np.searchsorted(share, 0.5 * share[-1]))]].strain)
 
     @property

@@ -17,8 +17,9 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# A surface so steep that a column moves the point less than this along its normal tells nothing more [m/px].
-FLOOR_M_PER_PX = 1e-3
+# Of how far a column moves a point, at least this share counts as along the normal: under 3 deg from ray to surface,
+# roughness tells more than the column. A least length would reward a head that shrinks what lies below it altogether.
+GRAZING = 0.05
 TILE_ROWS = 5
 TILE_TURN = np.radians(4.0)
 # The smallest flat piece: patches, bearings, rows of patches.
@@ -73,10 +74,17 @@ def grow(points: Array, per_column: Array, patches: Patches, tolerance_px: float
 
 def beside(points: Array, per_column: Array, plane: Array) -> Array:
     """Columns (...,) that points (..., 3) lie beside their plane (4,) or (..., 4), signed along the image."""
-    along, height = (np.einsum("...i,...i->...", part, plane[..., :3]) for part in (per_column, points))
-    steep = np.copysign(np.maximum(np.abs(along), FLOOR_M_PER_PX), along)
-    columns: Array = (height + plane[..., 3]) / steep
+    height = np.einsum("...i,...i->...", points, plane[..., :3])
+    columns: Array = (height + plane[..., 3]) / steepness(per_column, plane[..., :3])
     return columns
+
+
+def steepness(per_column: Array, normal: Array) -> Array:
+    """How far (...,) a column moves points along the normal of their plane (..., 3) [m/px], signed, never nothing."""
+    along = np.einsum("...i,...i->...", per_column, normal)
+    least = GRAZING * np.sqrt(np.einsum("...i,...i->...", per_column, per_column))
+    steep: Array = np.copysign(np.maximum(np.abs(along), least), along)
+    return steep
 
 
 def near_another(points: Array, per_column: Array, segments: Segments, reach_px: float) -> Mask:
@@ -100,7 +108,7 @@ def fitted_plane(points: Array, per_column: Array, normal: Array | None = None, 
     weight = np.ones(len(points))
     for _ in range(rounds + 1):
         if normal is not None:
-            weight = 1.0 / np.maximum(np.abs(per_column @ normal), FLOOR_M_PER_PX) ** 2
+            weight = steepness(per_column, normal) ** -2
         centre = weight @ points / weight.sum()
         q = points - centre
         normal = np.linalg.eigh((q * weight[:, None]).T @ q)[1][:, 0]
@@ -134,7 +142,7 @@ def _tiles(points: Array, per_column: Array, known: Mask, step: float) -> list[_
     here = known[shot, row]
     p, slope = np.where(here[..., None], points[shot, row], 0.0), np.where(here[..., None], per_column[shot, row], 1.0)
     plane = _batch_planes(p, here.astype(float))
-    weight = here / np.maximum(np.abs((slope * plane[:, None, :3]).sum(axis=-1)), FLOOR_M_PER_PX) ** 2
+    weight = here / steepness(slope, plane[:, None, :3]) ** 2
     plane = _batch_planes(p, weight)
     off = np.where(here, beside(p, slope, plane[:, None, :]), 0.0)
     rms = np.sqrt((off**2).sum(axis=1) / here.sum(axis=1))

@@ -7,9 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.solvers.flat_segments import FLOOR_M_PER_PX
+from scanmap.solvers.flat_segments import steepness
 
 Array = NDArray[np.float64]
+
+# What a head does not see at all counts as the camera's centre, moved by so much: far beside its plane.
+UNSEEN_M_PER_PX = 1e-3
 
 
 class Pieces(NamedTuple):
@@ -29,21 +32,21 @@ def beside_own_planes(points: Array, per_column: Array, own: Array, pieces: Piec
         pieces: their normals are where the fits start, and the side on which the new ones are.
     """
     piece, first, normals = pieces
-    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column)
+    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column, nan=UNSEEN_M_PER_PX)
     for _ in range(2):
-        weight = own / _steepness(per_column, normals[piece]) ** 2
+        weight = own / steepness(per_column, normals[piece]) ** 2
         q = points - _centres(points, weight, first)[piece]
         moments = np.add.reduceat(q[:, :, None] * q[:, None, :] * weight[:, None, None], first)
         normals = np.linalg.eigh(moments)[1][:, :, 0]
-    off: Array = (q * normals[piece]).sum(axis=1) / _steepness(per_column, normals[piece])
+    off: Array = (q * normals[piece]).sum(axis=1) / steepness(per_column, normals[piece])
     return off, normals * np.copysign(1.0, (normals * pieces.normals).sum(axis=1))[:, None]
 
 
 def azimuth_influence(points: Array, per_column: Array, own: Array, pieces: Pieces) -> Array:
     """What an error of a column of each point (N,) does to its upright piece's azimuth [rad/px]."""
     piece, first, normals = pieces
-    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column)
-    steep = _steepness(per_column, normals[piece])
+    points, per_column = np.nan_to_num(points), np.nan_to_num(per_column, nan=UNSEEN_M_PER_PX)
+    steep = steepness(per_column, normals[piece])
     q = points - _centres(points, own / steep**2, first)[piece]
     across = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(first))], axis=1)
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -71,13 +74,6 @@ def leans(wall: Array, floor: Array) -> Array:
     up = np.linalg.solve(rows.T @ rows + 0.01 * np.eye(2), rows.T @ lean)
     left: Array = lean - rows @ up
     return left
-
-
-def _steepness(per_column: Array, normal: Array) -> Array:
-    """(N,) how far a column moves each point along its normal [m/px], not less than what still tells something."""
-    along = (per_column * normal).sum(axis=1)
-    steep: Array = np.where(along >= 0, 1.0, -1.0) * np.maximum(np.abs(along), FLOOR_M_PER_PX)
-    return steep
 
 
 def _centres(points: Array, weight: Array, first: NDArray[np.intp]) -> Array:

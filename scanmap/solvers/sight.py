@@ -20,6 +20,8 @@ PATCHES = 300
 STRAIGHT_PX = 1.0
 # Rows along which the line runs off faster than this belong to a ledge [px a row].
 STEEPEST = 3.0
+# A line that stands this close says the same again [px].
+SAME_COLUMN_PX = 1.0
 # Bearings closer than this were meant to be the same [rad].
 SAME_BEARING = float(np.radians(0.02))
 
@@ -108,6 +110,13 @@ def patches_of(lines: Lines) -> Patches:
         np.where(good, mean_column, np.nan), np.where(good, mean_row, np.nan),
         np.where(known, sigma, 0.0).sum(axis=2) / share, lines.bearings,
     )  # fmt: skip
+
+
+def places_of(patches: Patches) -> NDArray[np.intp]:
+    """Number (B, R) of the place in the picture where each patch stands; -1 where there is none."""
+    column = np.round(np.nan_to_num(patches.column_px, nan=-1.0) / SAME_COLUMN_PX).astype(np.intp)
+    rows = column.shape[1]
+    return np.where(np.isfinite(patches.column_px), column * rows + np.arange(rows), -1)
 
 
 def _merged(lines: Lines) -> Lines:

@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field
 from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import moved, uncertainty_of
 from scanmap.solvers.budget import deviations
-from scanmap.solvers.flat_segments import FLOOR_M_PER_PX, Segments, beside, fitted_plane
-from scanmap.solvers.sight import Patches, Sight, located, sight_of
+from scanmap.solvers.flat_segments import Segments, beside, fitted_plane, steepness
+from scanmap.solvers.sight import Patches, Sight, located, places_of, sight_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,7 +43,7 @@ class Wall:
     """One flat piece, measured."""
 
     plane: Array  # (4,) world frame
-    patches: int
+    places: int  # different ones in the picture: a line that stands still says the same again
     bearings: int
     length_m: float
     range_m: float  # median
@@ -84,9 +84,7 @@ def walls_under(
         plane = fitted_plane(points[member], per_column[member], segments.planes[k, :3])
         plane *= np.sign(plane[3]) or 1.0  # the normal toward the axis
         off[member] = beside(points[member], per_column[member], plane)
-        walls.append(
-            _wall(points[member], per_column[member], plane, patches.sigma_px[member], member, spread, allowed)
-        )
+        walls.append(_wall(points[member], per_column[member], plane, patches, member, spread, allowed))
     return tuple(walls), off
 
 
@@ -120,7 +118,7 @@ def _wall(
     points: Array,
     per_column: Array,
     plane: Array,
-    sigma: Array,
+    patches: Patches,
     member: Mask,
     spread: _Spread,
     allowed: tuple[float, CheckParams],
@@ -128,12 +126,12 @@ def _wall(
     noise_px, params = allowed
     normal = plane[:3]
     height = points @ normal + plane[3]
-    per_px = np.maximum(np.abs(per_column @ normal), FLOOR_M_PER_PX)
+    per_px = np.abs(steepness(per_column, normal))
     along = _longest(points, normal)
     length = float(np.ptp(np.percentile(along, [1.0, 99.0])))
     own_m = 1e-3 * params.wall_mm_per_m * length
     moved_by = spread.along(member, normal)
-    line = np.hypot(sigma, noise_px) * per_px
+    line = np.hypot(patches.sigma_px[member], noise_px) * per_px
     bearings = int(np.count_nonzero(member.any(axis=1)))
     bow = _bow(along, height, per_px)
     tilted = [_without_plane(points, part, normal) for part in moved_by]
@@ -145,7 +143,7 @@ def _wall(
     inside = np.abs(height) <= 4.0 * 1.4826 * np.median(np.abs(height))
     return Wall(
         plane=plane,
-        patches=len(points),
+        places=len(np.unique(places_of(patches)[member])),
         bearings=bearings,
         length_m=length,
         range_m=float(np.median(np.linalg.norm(points, axis=1))),
