@@ -13,7 +13,7 @@ from scanmap.calibration.uncertainty import Uncertainty
 from scanmap.errors import CalibrationError
 from scanmap.geometry import HeadMount, inverse, transform
 from scanmap.solvers.check import check
-from scanmap.solvers.check_words import notes, verdict_lines
+from scanmap.solvers.check_words import conclusion, notes, verdict_lines
 from scanmap.solvers.flat_segments import Segments
 from scanmap.solvers.passes import compare_passes
 from scanmap.solvers.sight import Lines, Patches
@@ -86,6 +86,14 @@ def test_rooms_that_are_not_square_are_said_and_can_be_excused() -> None:
     judged = check(opened, head())
     assert not judged.corners_hold
     assert check(opened, head(), CheckParams(square=False)).corners_hold
+
+
+def test_where_nobody_can_tell_walls_from_calibration_it_is_not_called_wrong() -> None:
+    """A true head, bearings 20 deg apart: a wall and what stands before it are taken for one bent wall."""
+    judged = check(room_lines(NOISE_PX, seed=2, bearings=np.arange(0.0, 181.0, 20.0)), head())
+    assert judged.refined is None and not judged.passed
+    assert "cannot tell whether the calibration" in conclusion(judged) and "contradicts" not in conclusion(judged)
+    assert any(judged.unrefined and judged.unrefined in line for line in notes(judged))
 
 
 def test_nothing_flat_is_nothing_to_judge_by() -> None:

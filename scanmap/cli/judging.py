@@ -138,10 +138,11 @@ def check(
         write_walls(rrd, [in_space(name, head, judged.segments, judged.patches) for name, head in heads])
         say(f"wrote {rrd}")
     if not judged.passed:
-        say(
-            f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}{_given(calibration)}"
-            ", or with a board: scanmap calibrate laser"
-        )
+        if judged.refined is not None:
+            say(
+                f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}{_given(calibration)}"
+                ", or with a board: scanmap calibrate laser"
+            )
         raise typer.Exit(1)
 
 
@@ -212,7 +213,7 @@ def _print_check(judged: Check) -> None:
     from rich.table import Table
 
     from scanmap.cli.terminal import console, say
-    from scanmap.solvers.check_words import notes, verdict_lines
+    from scanmap.solvers.check_words import conclusion, notes, verdict_lines
 
     table = Table(padding=(0, 0), pad_edge=False)
     for name in ("wall", "range m", "length m", "bearings", "rms mm", "limit", "bow mm", "limit"):
@@ -227,8 +228,4 @@ def _print_check(judged: Check) -> None:
         say(f"{'pass' if passed else 'FAIL'}  {line}")
     for line in notes(judged):
         say(f"note  {line}")
-    say(
-        "PASS: nothing in this scan contradicts the calibration"
-        if judged.passed
-        else "FAIL: this scan contradicts the calibration"
-    )
+    say(conclusion(judged))

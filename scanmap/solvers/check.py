@@ -55,6 +55,7 @@ class Check:
     params: CheckParams
     known: Uncertainty | None  # what the calibration says of itself
     refined: Refined | None  # what self-calibration makes of the scan; None where it cannot
+    unrefined: str = ""  # why it cannot
 
     @property
     def strain(self) -> float:
@@ -115,10 +116,12 @@ def check(
     patches = patches_of(lines)
     sight = sight_of(patches, calibration.intrinsics)
     points, per_column = located(sight, calibration)
+    refined: Refined | None = None
+    unrefined = ""
     try:
-        refined: Refined | None = refine(lines, calibration, progress=progress)
-    except CalibrationError:
-        refined = None
+        refined = refine(lines, calibration, progress=progress)
+    except CalibrationError as error:
+        unrefined = str(error)
     segments = refined.segments if refined else grow(points, per_column, patches, params.tolerance_px)
     noise = max(params.line_error_px, refined.rms_after_px if refined else 0.0)
     known = int(np.isfinite(points[..., 0]).sum())
@@ -132,7 +135,7 @@ def check(
     walls, off = walls_under(calibration, patches, segments, chosen, (noise, params))
     return Check(
         walls, _corners(walls), compare_passes(lines, params.line_error_px), segments, patches, off, params,
-        uncertainty_of(calibration), refined,
+        uncertainty_of(calibration), refined, unrefined,
     )  # fmt: skip
 
 

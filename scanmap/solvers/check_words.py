@@ -19,6 +19,18 @@ def verdict_lines(check: Check) -> list[tuple[bool, str]]:
     return lines
 
 
+def conclusion(check: Check) -> str:
+    """The last word."""
+    if check.passed:
+        return "PASS: nothing in this scan contradicts the calibration"
+    if check.refined is None and check.passes_agree:
+        return (
+            "FAIL: walls are not flat, but this scan cannot tell whether the calibration bends them or two surfaces "
+            "were taken for one; scan again in steps of 1 deg, at the camera's full resolution"
+        )
+    return "FAIL: this scan contradicts the calibration"
+
+
 def notes(check: Check) -> list[str]:
     """What was not asked, and why."""
     said = []
@@ -29,7 +41,7 @@ def notes(check: Check) -> list[str]:
     elif not check.params.square:
         said.append("corners: shown, not judged")
     if check.refined is None:
-        said.append("self-calibration cannot help here; walls are judged as they were found")
+        said.append(f"walls are judged as they were found, for self-calibration cannot help: {check.unrefined}")
     if check.known is None:
         said.append("the calibration states no covariance: it is held to the line's noise alone, as if it were exact")
     return said
