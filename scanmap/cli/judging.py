@@ -45,8 +45,8 @@ def self_(
     """Refine a head without a board, by a scan of an ordinary room.
 
     Walls must come out flat, passes must agree, a full turn must close: that gives the head's offset from the axis, the
-    axis's tilt and the laser plane against the camera. Says what it could not observe, and writes nothing that is not
-    better.
+    axis's tilt and the laser plane against the camera. On a turntable, printed markers (ArUco, AprilTag) tell the axis.
+    Says what it could not observe, and writes nothing that is not better.
 
     Example: scanmap calibrate self room.mcap --out calibration.toml
     """
@@ -61,7 +61,10 @@ def self_(
     refuse_file("--rrd", rrd, ".rrd")
     measured, is_twin = _measure(recording, config, set_, calibration)
     with rounds_bar("making walls flat") as progress:
-        refined = refine(measured.lines, measured.calibration, None if scale == "auto" else scale, progress=progress)
+        refined = refine(
+            measured.lines, measured.calibration, None if scale == "auto" else scale, marks=measured.marks,
+            progress=progress,
+        )  # fmt: skip
     _print_refined(refined)
     if figure is not None:
         from scanmap.solvers.wall_figures import draw_refined
@@ -121,7 +124,7 @@ def check(
     measured, _ = _measure(recording, config, set_, calibration)
     params = CheckParams(square=not not_square, wall_mm_per_m=wall_mm_per_m)
     with rounds_bar("judging walls") as progress:
-        judged = judge(measured.lines, measured.calibration, params, progress=progress)
+        judged = judge(measured.lines, measured.calibration, params, marks=measured.marks, progress=progress)
     _print_check(judged)
     if figure is not None:
         from scanmap.solvers.wall_figures import draw_check
@@ -182,7 +185,7 @@ def _print_refined(refined: Refined) -> None:
     from rich.table import Table
 
     from scanmap.cli.terminal import console, say
-    from scanmap.solvers.self_words import UNOBSERVABLE, before_and_after, parameter_lines, scale_words
+    from scanmap.solvers.self_words import UNOBSERVABLE, before_and_after, marks_words, parameter_lines, scale_words
 
     say(f"{len(refined.segments)} flat pieces; {scale_words(refined)}")
     table = Table(padding=(0, 0), pad_edge=False)
@@ -201,6 +204,8 @@ def _print_refined(refined: Refined) -> None:
         )  # fmt: skip
     console.print(walls)
     say(f"all flat pieces: {refined.rms_before_px:.3f} px rms before, {refined.rms_after_px:.3f} px after")
+    if refined.followed is not None:
+        say(marks_words(refined.followed))
     if refined.square.walls:
         say(
             f"{refined.square.walls} upright pieces are square to each other to about "

@@ -16,6 +16,8 @@ from scanmap.errors import CalibrationError, RecordingError
 from scanmap.pipeline import Pipeline, Step, checked
 from scanmap.session.job import Job, Progress
 from scanmap.shot import Shot
+from scanmap.solvers.freedom import longer_length
+from scanmap.solvers.marks import Marks, MarkSeeker
 from scanmap.solvers.self_calibration import Refined
 from scanmap.solvers.sight import Lines, LineStore
 
@@ -28,12 +30,15 @@ class Measured:
     """The lines of a recording and the head they were measured with."""
 
     lines: Lines
+    marks: Marks | None  # on the turntable
     calibration: Calibration
     faults: list[str]
 
 
 def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> Measured:
     """Find the line in every shot of a replay, a little beyond the columns that the calibration allows.
+
+    On a turntable, the printed markers too.
 
     Raises:
         CalibrationError: the images are of another size.
@@ -45,6 +50,7 @@ def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable
         job.calibration, job.config.laserline, job.config.triangulation, slack_px=float(own.fx * SEARCH_RAD)
     )
     store, faults, done = LineStore(), list(job.source_faults), 0
+    seeker = MarkSeeker() if longer_length(job.calibration) == "axis" else None
 
     def keep(step: Step) -> None:
         nonlocal done
@@ -52,6 +58,8 @@ def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable
         if step.fault:
             faults.append(f"shot {step.shot.index}: {step.fault}")
         store.add(step.line, step.shot.bearing)
+        if seeker is not None:
+            seeker.look(step.shot)
         found = int(np.isfinite(step.line.column_px).sum())
         progress(Progress(done, job.total, float(np.degrees(step.shot.bearing)), found, own.height))
 
@@ -64,7 +72,7 @@ def measure_lines(job: Job, progress: Callable[[Progress], None], stop: Callable
     lines = store.lines()
     if not np.isfinite(lines.column_px).any():
         raise RecordingError("no laser line found in any shot: is the laser on, and is this the head's calibration?")
-    return Measured(lines, job.calibration, faults)
+    return Measured(lines, seeker.marks() if seeker is not None else None, job.calibration, faults)
 
 
 def write_refined(refined: Refined, out: Path, recording: Path, *, is_twin: bool) -> Path | None:

@@ -1,6 +1,7 @@
 """Least squares over a head's changes, with the planes of all flat pieces eliminated, and what its result is worth.
 
-Variable projection (Golub and Pereyra 1973), residuals in image columns, Cauchy weights, a ruler's knowledge as prior.
+Variable projection (Golub and Pereyra 1973), residuals in image columns, Cauchy weights; a ruler's knowledge as prior,
+or that of markers on a turntable.
 
 What limits such a fit is not a patch's noise but what patches have in common: all that one shot shows of one piece is
 off alike, by JPEG's blocks and the lens's glare, and comes again wherever the line stands in the same column. A shot's
@@ -145,7 +146,7 @@ class Adjustment:
 
             def weighed(x: Array, weight: Array = weight, steady: Array = steady) -> Array:
                 off, lean = self.residual(x, weight)
-                return np.concatenate([off * np.sqrt(weight), lean * steady, x / self.free.ruler])
+                return np.concatenate([off * np.sqrt(weight), lean * steady, (x - self.free.centre) / self.free.sigma])
 
             found = least_squares(weighed, change, x_scale=self.free.ruler, max_nfev=12, ftol=1e-6, xtol=1e-6)
             change = found.x

@@ -18,6 +18,7 @@ from scanmap.calibration import Calibration
 from scanmap.calibration.uncertainty import Uncertainty, uncertainty_of
 from scanmap.errors import CalibrationError
 from scanmap.solvers.flat_segments import Segments, grow
+from scanmap.solvers.marks import Marks
 from scanmap.solvers.passes import Passes, compare_passes
 from scanmap.solvers.self_calibration import Estimate, Refined, refine
 from scanmap.solvers.sight import Lines, Patches, located, patches_of, sight_of
@@ -101,12 +102,13 @@ class Check:
 
 
 def check(
-    lines: Lines, calibration: Calibration, params: CheckParams | None = None, *,
+    lines: Lines, calibration: Calibration, params: CheckParams | None = None, *, marks: Marks | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Check:  # fmt: skip
     """Judge a calibration by one scan.
 
     Args:
+        marks: printed markers on a turntable, for self-calibration.
         progress: told after every round how many of how many are done.
 
     Raises:
@@ -119,7 +121,7 @@ def check(
     refined: Refined | None = None
     unrefined = ""
     try:
-        refined = refine(lines, calibration, progress=progress)
+        refined = refine(lines, calibration, marks=marks, progress=progress)
     except CalibrationError as error:
         unrefined = str(error)
     segments = refined.segments if refined else grow(points, per_column, patches, params.tolerance_px)

@@ -63,6 +63,8 @@ class Freedom(NamedTuple):
     names: tuple[str, ...]  # P of `NAMES`
     ruler: Array  # (P,) one standard deviation of each before
     pivot_m: float | None  # height of the axis' point about which it tilts; the head's origin if None
+    centre: Array  # (P,) where each is expected
+    sigma: Array  # (P,) one standard deviation about there; the ruler's where nothing else tells
 
     @classmethod
     def of(cls, calibration: Calibration, scale: Scale, height_m: float) -> Freedom:
@@ -76,7 +78,15 @@ class Freedom(NamedTuple):
             for name, said in (("aside", "offset_y"), ("tilt_x", "tilt_x"), ("tilt_y", "tilt_y")):
                 ruler[name] = min(ruler[name], known.sigma(said) or ruler[name])
         names = FREE[scale]
-        return cls(names, np.array([ruler[name] for name in names]), height_m if scale == "axis" else None)
+        by_ruler = np.array([ruler[name] for name in names])
+        return cls(names, by_ruler, height_m if scale == "axis" else None, np.zeros(len(names)), by_ruler)
+
+    def told(self, names: Sequence[str], change: Array, sigma: Array) -> Freedom:
+        """The same where something else tells some of the changes, with deviations."""
+        at = [self.names.index(name) for name in names]
+        centre, own = self.centre.copy(), self.sigma.copy()
+        centre[at], own[at] = change, np.minimum(own[at], sigma)
+        return self._replace(centre=centre, sigma=own)
 
     def changed(self, calibration: Calibration, change: Array) -> Calibration:
         """The head with a change (P,) in it."""

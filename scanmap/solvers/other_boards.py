@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from scanmap.shot import Image
 from scanmap.solvers.board import Board
 from scanmap.solvers.chessboard import find_part
 from scanmap.solvers.detection import Rejected, View
+from scanmap.solvers.marks import FAMILIES, marks_in
 
 Array = NDArray[np.float64]
 
@@ -25,9 +26,6 @@ LAYOUT_OFF = 0.15
 SQUARES_MOST = 24
 # So many pictures must have room for a row that none of them shows.
 MISSED_LEAST = 4
-FAMILIES = (
-    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
-)  # fmt: skip
 
 
 class Layout(NamedTuple):
@@ -40,15 +38,15 @@ class Layout(NamedTuple):
 def seen_instead(image: Image, board: Board) -> str:
     """What a picture without the board shows in its place, as far as it can be told; empty if nothing."""
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-    marks = _marks(grey, FAMILIES[0])
+    marks = marks_in(grey, FAMILIES[0])
     layout = layout_of(marks) if len(marks) >= LAYOUT_LEAST else None
     if layout is not None and (board.kind != "charuco" or layout != (board.columns, board.rows)):
         return _charuco_words(layout, board)
     if board.kind == "charuco":
-        if len(_marks(np.ascontiguousarray(grey[:, ::-1]), FAMILIES[0])) >= MARKERS_LEAST > len(marks):
+        if len(marks_in(np.ascontiguousarray(grey[:, ::-1]), FAMILIES[0])) >= MARKERS_LEAST > len(marks):
             return "the picture is mirrored: turn mirroring off in the camera"
         for family in FAMILIES[1:]:
-            if len(_marks(grey, family)) >= MARKERS_LEAST:
+            if len(marks_in(grey, family)) >= MARKERS_LEAST:
                 return f"its markers are of {family[5:]}, and scanmap reads 4X4 ones: print one with scanmap board"
     grid = find_part(grey, thorough=True)
     if grid is None and marks:
@@ -169,13 +167,3 @@ def _charuco_words(layout: Layout, board: Board) -> str:
         f"the board in the pictures is {columns} squares wide and at least {rows} high, not "
         f"{board.columns}x{board.rows}: use --board {name} (count the squares)"
     )
-
-
-def _marks(grey: Image, family: str) -> dict[int, Array]:
-    """Corners (4, 2) of the markers in a picture by their numbers."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
-    found: Any = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters()).detectMarkers(grey)
-    corners, numbers = found[0], found[1]
-    if numbers is None:
-        return {}
-    return {int(n): np.asarray(c, np.float64).reshape(4, 2) for n, c in zip(numbers.ravel(), corners, strict=True)}

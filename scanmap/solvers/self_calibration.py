@@ -4,6 +4,7 @@ Flat pieces of the scan are found with the head as it is, however bent; the head
 as well as it can; and again, with less tolerance, until only the line's own noise is left. Repeated bearings and the
 overlap of a full turn lie on the same pieces, so that passes must agree and the turn must close.
 
+Where a table turns before a fixed head, printed markers on it tell how its axis leans, which a block's faces hardly do.
 In the end walls that seem to be meant square to each other are taken for it, as far as they bear it out.
 """
 
@@ -21,6 +22,7 @@ from scanmap.errors import CalibrationError
 from scanmap.solvers.adjustment import Adjustment
 from scanmap.solvers.flat_segments import Segments, grow, near_another
 from scanmap.solvers.freedom import Freedom, Scale, longer_length, redrawn
+from scanmap.solvers.marks import TOLD, Followed, Marks, follow
 from scanmap.solvers.sight import Lines, Patches, located, patches_of, sight_of
 from scanmap.solvers.squareness import Squared, squared
 
@@ -69,6 +71,7 @@ class Refined:
     rms_before_px: float  # of the same pieces, in image columns
     rms_after_px: float
     square: Squared  # what the walls' directions added
+    followed: Followed | None  # what markers on the turntable said, if there are any
     gained: bool  # whether walls are flatter after, by a change beyond chance
 
     def estimate(self, name: str) -> Estimate:
@@ -77,7 +80,7 @@ class Refined:
 
 
 def refine(
-    lines: Lines, calibration: Calibration, scale: Scale | None = None, *,
+    lines: Lines, calibration: Calibration, scale: Scale | None = None, *, marks: Marks | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Refined:  # fmt: skip
     """Refine a head from the laser lines of one scan of a room, or of a block on a turntable.
@@ -86,6 +89,7 @@ def refine(
         lines: of all shots, laser on anything flat.
         calibration: the head as it is known; its intrinsics stay.
         scale: the length that holds the scale; the longer one if left out.
+        marks: printed markers that turn with the table; they tell its axis, where the axis holds the scale.
         progress: told after every round how many of how many are done.
 
     Raises:
@@ -106,7 +110,10 @@ def refine(
     sight = sight_of(patches, calibration.intrinsics)
     height = located(sight, calibration)[0][..., 2]
     free = Freedom.of(calibration, scale, float(np.median(np.append(height[np.isfinite(height)], 0.0))))
-    change, tolerance = np.zeros(len(free.names)), START_TOLERANCE_PX
+    followed = follow(marks, calibration, free) if marks is not None and scale == "axis" else None
+    if followed is not None:
+        free = free.told(TOLD, followed.change, followed.sigma)
+    change, tolerance = free.centre, START_TOLERANCE_PX
     for done in range(1, ROUNDS + 1):
         points, per_column = located(sight, free.changed(calibration, change))
         segments = grow(points, per_column, patches, tolerance)
@@ -122,7 +129,7 @@ def refine(
         if progress is not None:
             progress(done, ROUNDS)
     square = squared(adjustment.upright(solution), solution.covariance)
-    outcome = _Outcome(calibration, scale, free, change + square.change, square)
+    outcome = _Outcome(calibration, scale, free, change + square.change, square, followed)
     return _judged(outcome, (adjustment, solution.weight), segments, patches)
 
 
@@ -135,6 +142,7 @@ class _Outcome:
     free: Freedom
     change: Array
     square: Squared
+    followed: Followed | None
 
     @property
     def covariance(self) -> Array:
@@ -170,7 +178,7 @@ def _judged(outcome: _Outcome, fit: tuple[Adjustment, Array], segments: Segments
     chance = len(outcome.change) + CHANCE * float(np.sqrt(2.0 * len(outcome.change)))
     return Refined(
         outcome.calibration, _finished(outcome), outcome.scale, estimates, segments, patches, before, after,
-        outcome.square, after < before and beyond > chance,
+        outcome.square, outcome.followed, after < before and beyond > chance,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanmap.calibration import Calibration
+from scanmap.solvers.marks import Followed
 from scanmap.solvers.self_calibration import Estimate, Refined
 from scanmap.solvers.walls import CheckParams, Wall, walls_under
 
@@ -65,6 +66,15 @@ def scale_words(refined: Refined) -> str:
     return (
         f"scale is held by the axis, {distance:.2f} mm from the head: flat faces stay flat at any scale; or give "
         "--scale baseline"
+    )
+
+
+def marks_words(followed: Followed) -> str:
+    """What markers on the turntable said of its axis."""
+    aside, tilt_x, tilt_y = 1e3 * followed.change[0], *np.degrees(followed.change[1:])
+    return (
+        f"{followed.markers} printed markers, followed around: against the calibration the axis leans by {tilt_x:+.2f} "
+        f"and {tilt_y:+.2f} deg about x and y and passes {aside:+.2f} mm aside ({followed.rms_px:.2f} px rms)"
     )
 
 
