@@ -295,7 +295,7 @@ def test_real_photographs(data: Path) -> None:
     assert np.degrees(np.arccos(side * fit.plane[:3] @ n)) < 0.15
     assert abs(side * fit.plane[3] - d) < 0.7e-3
     assert fit.rms_m <= 0.55e-3
-    assert len(fit.lines) >= 80
+    assert len(fit.lines) >= 105
     assert check_laser(job, solved.calibration, None)[1] < 1.0
 
 

@@ -20,6 +20,9 @@ LOOKED_AT_PX, THOROUGHLY_PX = 1600, 800
 CORNERS_MOST = 41
 # Where a corner's four squares are looked at: this far from it [squares] along both directions.
 QUADRANTS = (0.2, 0.3, 0.4)
+# The same over whole squares, which only a grid without gap or shear has of one colour.
+WHOLE_SQUARES = (0.2, 0.5, 0.8)
+DIAGONALS = ((1, 1), (-1, -1), (1, -1), (-1, 1))  # of a corner's squares: two of one colour, two of the other
 # Both light squares at a corner are lighter than both dark ones by this share of what lies between them all.
 CHEQUERED = 0.35
 # [grey levels] between light and dark squares: less is noise.
@@ -28,6 +31,8 @@ FAINT_DN = 8.0
 CONTRAST_LEAST = 0.25
 # [squares] a corner may lie from where its neighbours put it.
 BESIDE_MOST = 0.2
+# Corners that a piece of a board has, to begin with: asked for more, OpenCV is less often led astray by clutter.
+PIECES = ((3, 3), (5, 3), (6, 3))
 # A grid with fewer corners may be anything with right angles in it.
 CERTAIN_CORNERS = 12
 
@@ -75,11 +80,36 @@ def find_part(grey: Image, *, thorough: bool = False) -> Grid | None:
     From a piece that is surely found the grid is grown corner by corner, each where its neighbours put it.
     """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
-    piece = _looked_for(grey, (3, 3), flags, THOROUGHLY_PX)
-    if piece is None:
-        return None
-    grid = trimmed(grey, grown(grey, piece))
-    return grid if grid.seen.sum() >= CERTAIN_CORNERS else None
+    for size in PIECES:
+        piece = _looked_for(grey, size, flags, THOROUGHLY_PX)
+        seed = _sound(grey, piece) if piece is not None else None
+        grid = trimmed(grey, grown(grey, seed)) if seed is not None else None
+        if grid is not None and grid.seen.sum() >= CERTAIN_CORNERS:
+            return grid
+    return None
+
+
+def _sound(grey: Image, piece: Grid) -> Grid | None:
+    """The piece or a window of it that surely is a grid: OpenCV's may leave rows out, or go on a column beside."""
+    if _is_grid(grey, piece.corners):
+        return piece
+    across, down = piece.shape
+    for rows, columns in ((3, 3), (2, 3), (3, 2)):
+        for top, left in product(range(down - rows + 1), range(across - columns + 1)):
+            window = piece.corners[top : top + rows, left : left + columns]
+            if _is_grid(grey, window):
+                return Grid(window)
+    return None
+
+
+def _is_grid(grey: Image, corners: Array) -> bool:
+    """Whether the squares around all corners (rows, columns, 2) are light and dark in turn, each all over."""
+    samples = [np.array(_samples(grey, corners, *side, WHOLE_SQUARES)) for side in DIAGONALS]
+    one, other = np.concatenate(samples[:2]), np.concatenate(samples[2:])
+    odd = np.indices(corners.shape[:2]).sum(axis=0) % 2 == 1
+    one, other = np.where(odd, other, one), np.where(odd, one, other)
+    lighter, darker = one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0)
+    return bool((lighter > FAINT_DN).all() or (darker > FAINT_DN).all())
 
 
 def grown(grey: Image, piece: Grid) -> Grid:
@@ -121,7 +151,7 @@ def trimmed(grey: Image, grid: Grid) -> Grid:
 def chequered(grey: Image, grid: Grid) -> Mask:
     """(rows, columns) at which corners two light and two dark squares meet, the way round that most corners have."""
     corners = grid.corners
-    level = np.array([_levels(grey, corners, *side) for side in ((1, 1), (-1, -1), (1, -1), (-1, 1))])
+    level = np.array([_levels(grey, corners, *side) for side in DIAGONALS])
     with np.errstate(invalid="ignore"):
         light = np.minimum(level[0], level[1]) - np.maximum(level[2], level[3])
         dark = np.minimum(level[2], level[3]) - np.maximum(level[0], level[1])
@@ -148,16 +178,21 @@ def _looked_for(grey: Image, size: tuple[int, int], flags: int, within: int) -> 
 
 def _levels(grey: Image, corners: Array, along: int, across: int) -> Array:
     """Mean grey level (rows, columns) of the square beside each corner in one direction; NaN where it is not known."""
+    return np.asarray(sum(_samples(grey, corners, along, across, QUADRANTS)) / len(QUADRANTS) ** 2)
+
+
+def _samples(grey: Image, corners: Array, along: int, across: int, at_shares: tuple[float, ...]) -> list[Array]:
+    """Grey levels (rows, columns) at places in the square beside each corner in one direction; NaN where not known."""
     steps = [along * _steps(corners, 1), across * _steps(corners, 0)]
     height, width = grey.shape
-    total = np.zeros(corners.shape[:2])
-    for a, b in product(QUADRANTS, QUADRANTS):
+    samples = []
+    for a, b in product(at_shares, at_shares):
         at = corners + a * steps[0] + b * steps[1]
         outside = (at < 0).any(axis=-1) | (at > [width - 1, height - 1]).any(axis=-1)
         known = np.isfinite(at).all(axis=-1) & ~outside
         u, v = (np.where(known, at[..., k], 0.0).astype(np.float32) for k in (0, 1))
-        total += np.where(known, cv2.remap(grey, u, v, cv2.INTER_LINEAR), np.nan)
-    return np.asarray(total / len(QUADRANTS) ** 2)
+        samples.append(np.where(known, cv2.remap(grey, u, v, cv2.INTER_LINEAR), np.nan))
+    return samples
 
 
 def _steps(corners: Array, axis: int) -> Array:
@@ -207,7 +242,7 @@ def _add(grey: Image, room: Array, at: tuple[int, int]) -> bool:
 
 def _one_chequered(grey: Image, small: Array) -> bool:
     """Whether two light and two dark squares meet at the corner in the middle of `small` (3, 3, 2)."""
-    level = np.array([_levels(grey, small, *side)[1, 1] for side in ((1, 1), (-1, -1), (1, -1), (-1, 1))])
+    level = np.array([_levels(grey, small, *side)[1, 1] for side in DIAGONALS])
     if not np.isfinite(level).all():
         return False
     between = float(np.ptp(level))
