@@ -1,11 +1,15 @@
 """The loop: order, memory, faults, and what comes through when the source breaks."""
 
 import os
+import pickle
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import cast
 
 import cv2
@@ -267,10 +271,53 @@ def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
     assert all((step.line.reason == Reason.OK).mean() > 0.99 for step in steps)
 
 
+_BITS = """
+import os, pickle, signal, sys, threading
+from scanmap.pipeline import Processes, run
+from scanmap.pipeline.starting import _is_alone
+
+pipeline, shots = pickle.load(sys.stdin.buffer)
+expected, got = [], []
+run(shots, pipeline.process, [expected.append], workers=1)
+assert _is_alone()
+with Processes(pipeline, count=2) as workers:
+    for pid in workers.pids:
+        with open(f"/proc/{pid}/cmdline") as own, open("/proc/self/cmdline") as ours:
+            assert own.read() == ours.read(), "not a copy"
+    workers.run(shots, [got.append])
+assert [worker.exit_code for worker in workers._workers] == [0, 0], "one waits for a pipe that another holds"
+with Processes(pipeline, count=2) as workers:
+    workers.run(shots, [lambda step: os.kill(workers.pids[0], signal.SIGKILL)])
+assert [worker.exit_code for worker in workers._workers] == [-signal.SIGKILL, 0]
+for one, other in zip(expected, got, strict=True):
+    assert [a.tobytes() for a in (*one.line, *one.profile)] == [a.tobytes() for a in (*other.line, *other.profile)]
+waiting = threading.Event()
+threading.Thread(target=waiting.wait).start()
+with Processes(pipeline, count=1) as workers:
+    with open(f"/proc/{workers.pids[0]}/cmdline") as own, open("/proc/self/cmdline") as ours:
+        assert own.read() != ours.read(), "a copy of a process with threads"
+    workers.process(shots[0])
+waiting.set()
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted on Linux only")
+def test_a_process_without_threads_is_copied_and_copies_do_not_change_a_bit(pipeline: Pipeline) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _BITS],
+        input=pickle.dumps((pipeline, shots(30, jpeg=True))),
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr.decode()
+
+
 def test_no_worker_process_outlives_its_block(pipeline: Pipeline) -> None:
     with pytest.raises(StageError), Processes(pipeline, count=2) as workers:
         raise StageError("gone")
-    assert [worker._process.returncode for worker in workers._workers] == [0, 0]
+    assert [worker.exit_code for worker in workers._workers] == [0, 0]
 
 
 def test_worker_processes_only_where_there_is_enough_for_them() -> None:

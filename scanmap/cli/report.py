@@ -37,14 +37,18 @@ def progress_bar(work: str, total: int | None) -> Iterator[Callable[[Progress], 
         TextColumn("left{task.fields[where]}"),
     )  # fmt: skip
     # Not stdout: the console writes there itself.
-    with Bar(*columns, console=console, expand=True, redirect_stdout=False) as bar:
-        task = bar.add_task(work, total=total, where="")
+    bar = Bar(*columns, console=console, expand=True, redirect_stdout=False)
+    task = bar.add_task(work, total=total, where="")
 
-        def move(progress: Progress) -> None:
-            where = f", bearing {progress.bearing_deg:.2f} deg, {progress.rows_found}/{progress.rows} rows"
-            bar.update(task, completed=progress.done, total=progress.total, where=where)
+    def move(progress: Progress) -> None:
+        bar.start()  # not before: its thread would keep replay from copying this process
+        where = f", bearing {progress.bearing_deg:.2f} deg, {progress.rows_found}/{progress.rows} rows"
+        bar.update(task, completed=progress.done, total=progress.total, where=where)
 
+    try:
         yield move
+    finally:
+        bar.stop()
 
 
 @contextmanager

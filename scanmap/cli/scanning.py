@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -80,6 +81,8 @@ def replay(
 
     Example: scanmap replay room.mcap --set laserline.method=cog --out cog.ply
     """
+    # Nothing here is large matrices, and a process without threads can be copied instead of started anew.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from scanmap import session
 
     outputs = session.Outputs(tuple(out or ()), map_, rrd=rrd)

@@ -1,21 +1,16 @@
 """Worker processes: every core with an interpreter of its own.
 
 Decoding a JPEG leaves the interpreter's lock, but finding the line is many short NumPy calls that hold it: two threads
-did the work of one and a half. The workers are started as programs of their own rather than by `multiprocessing`,
-which would run the user's script once more in each of them, or copy a process in which rerun's threads hold locks.
+did the work of one and a half.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import gc
 import logging
 import os
 import pickle
 import queue
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
@@ -26,13 +21,14 @@ from numpy.typing import NDArray
 
 from scanmap.laserline import Laser, LaserLine
 from scanmap.pipeline.running import run_groups
+from scanmap.pipeline.starting import keep_memory, start
 from scanmap.pipeline.step import Pipeline, Sink, Step
 from scanmap.shot import Shot
 from scanmap.triangulation import Profile
 
 log = logging.getLogger(__name__)
 
-# Below so many shots a worker costs more to start (half a second) than it brings.
+# Below so many shots a worker costs more to start (half a second, where it is no copy) than it brings.
 WORTH_SHOTS = 100
 # Shots sent in one message, and looked at together: waking this process for each interrupted a worker ten times a
 # frame, and the line in twelve pictures at once costs three fifths of what it costs one by one. Of more pictures, what
@@ -43,27 +39,6 @@ IN_FLIGHT = 2
 # Reading shots and handing them to so many cores leaves this process time to work on some: it need not be started,
 # nor be sent anything. More cores than these keep it busy.
 _HELPS_CORES = 4
-# What a pipe should hold, where the system lets it: with its usual 64 kB either side waits for the other several times
-# a frame.
-_PIPE_BYTES = 1 << 20
-PATIENCE_S = 5.0
-# glibc gives large arrays back to the system as they are freed, and asking for them anew costs a fifth of a frame's
-# time in page faults, asking for little at a time another 3 %; elsewhere these names mean nothing. Names in the
-# environment of a worker, numbers (malloc.h) for this process.
-_KEEP_MEMORY = {
-    ("MALLOC_MMAP_THRESHOLD_", -3): 1 << 30,
-    ("MALLOC_TRIM_THRESHOLD_", -1): 1 << 30,
-    ("MALLOC_TOP_PAD_", -2): 1 << 26,
-}
-
-# The workers are the parallelism; threads that BLAS starts as it is imported cost a fifth of a worker's start.
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-# The worker imports scanmap from where this process did.
-# Importing makes no garbage.
-_START = (
-    "import gc; gc.disable(); import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from scanmap.pipeline.processes import serve; serve(sys.stdin.buffer, sys.stdout.buffer)"
-)
 
 
 class Answer(NamedTuple):
@@ -100,7 +75,7 @@ class Processes:
         self.threads = IN_FLIGHT * len(self._workers) + helps
         self._free: queue.SimpleQueue[_Worker | None] = queue.SimpleQueue()  # None: this process itself
         if helps:
-            _keep_memory()
+            keep_memory()
             self._free.put(None)
         for _ in range(IN_FLIGHT):
             for worker in self._workers:
@@ -152,25 +127,12 @@ class _Worker:
     """One worker process and its two pipes."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        # A session of its own: Ctrl-C is for this process, which ends its workers when it is done.
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _START],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-            env=os.environ | _ONE_THREAD | {name: str(size) for (name, _), size in _KEEP_MEMORY.items()},
-        )
-        self._to = cast(IO[bytes], self._process.stdin)
-        self._back = cast(IO[bytes], self._process.stdout)
-        for pipe in (self._to, self._back):
-            _widen(pipe)
+        self._started = start(pipeline, serve)
+        self._to, self._back = self._started.to, self._started.back
         self._sending = threading.Lock()
         self._last_read = threading.Event()
         self._last_read.set()
-        self.pid = self._process.pid
-        for first in (sys.path, pipeline):
-            pickle.dump(first, self._to, protocol=5)
-        self._to.flush()
+        self.pid = self._started.pid
 
     def ask(self, shots: list[Shot], laser: Laser | None) -> list[Answer]:
         """Send shots and what is known of the laser; the answers, which come in the order of messages, whoever asks."""
@@ -193,37 +155,12 @@ class _Worker:
         """End the worker: it stops when nothing more can come."""
         with contextlib.suppress(OSError):  # it is gone already
             self._to.close()
-        try:
-            self._process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self.exit_code = self._started.end()
         self._back.close()
 
 
-def _keep_memory() -> None:
-    """What the workers' environment says, for this process."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library
-        for (_, number), size in _KEEP_MEMORY.items():
-            ctypes.CDLL(None).mallopt(number, size)
-
-
-def _widen(pipe: IO[bytes]) -> None:
-    """Let a pipe hold more, where the system can and will."""
-    with contextlib.suppress(ImportError, AttributeError, OSError):
-        import fcntl
-
-        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-
-
-def serve(messages: IO[bytes], answers: IO[bytes]) -> None:
-    """The worker's own loop: a Pipeline first, then messages of shots until the pipe closes."""
-    import cv2
-
-    cv2.setNumThreads(1)  # the workers are the parallelism
-    pipeline = cast(Pipeline, pickle.load(messages))
-    gc.freeze()  # what was imported is never garbage
-    gc.enable()
+def serve(pipeline: Pipeline, messages: IO[bytes], answers: IO[bytes]) -> None:
+    """The worker's own loop: messages of shots until the pipe closes."""
     while True:
         try:
             pipeline.laser, shots = cast(tuple[Laser | None, list[Shot]], pickle.load(messages))

@@ -104,7 +104,7 @@ def run_groups(
                 sink(step)
             done += 1
 
-    with _single_threaded_opencv(), ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
+    with single_threaded_opencv(), ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
         try:
             for shot in shots:
                 ahead.append(shot)
@@ -123,7 +123,7 @@ def run_groups(
 
 
 @contextmanager
-def _single_threaded_opencv() -> Iterator[None]:
+def single_threaded_opencv() -> Iterator[None]:
     """The workers are the parallelism; OpenCV's own threads would only get in their way."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
