@@ -273,12 +273,11 @@ def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
 
 _BITS = """
 import os, pickle, signal, sys, threading
-from scanmap.pipeline import Processes, run
+from scanmap.pipeline import Processes
 from scanmap.pipeline.starting import _is_alone
 
 pipeline, shots = pickle.load(sys.stdin.buffer)
-expected, got = [], []
-run(shots, pipeline.process, [expected.append], workers=1)
+expected, got = [pipeline.process(shot) for shot in shots], []
 assert _is_alone()
 with Processes(pipeline, count=2) as workers:
     for pid in workers.pids:
