@@ -14,6 +14,7 @@ from recorded_shots import made_up_shots, record
 from scanmap.errors import CalibrationError, RecordingError
 from scanmap.recording import describe, open_source, recover
 from scanmap.recording.mcap_records import CHUNK, MESSAGE_INDEX, Record, open_mcap, walk
+from scanmap.recording.shot_file import ShotFile
 from scanmap.shot import Shot
 
 
@@ -215,6 +216,22 @@ def test_recovery_leaves_whole_and_empty_files_alone(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no whole message"):
         recover(tmp_path / "begun.mcap", tmp_path / "saved.mcap")
     assert not (tmp_path / "saved.mcap").exists()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_recovery_that_is_broken_off_leaves_no_half_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    path = record(tmp_path / "a.mcap", made_up_shots(5))
+    path.write_bytes(path.read_bytes()[:-3000])
+
+    def broken_off(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(ShotFile, "sync", broken_off)
+    with pytest.raises((KeyboardInterrupt, RecordingError)):
+        recover(path, tmp_path / "saved.mcap")
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_a_killed_program_loses_no_shot_it_has_written(tmp_path: Path) -> None:

@@ -22,7 +22,9 @@ def recover(
     Example: scanmap recover room.mcap
     """
     from scanmap import session
-    from scanmap.cli.terminal import say
+    from scanmap.cli.terminal import say, stop_on_signal
 
-    for line in session.recover(recording, out):
+    with stop_on_signal():
+        lines = session.recover(recording, out)
+    for line in lines:
         say(line)

@@ -49,11 +49,10 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
             raise RecordingError(f"recording {path} holds no whole message, there is nothing to recover")
         if not copy.lost and not any(found.damaged for found in parts) and len(parts) == 1:
             raise RecordingError(f"recording {path} is whole, there is nothing to recover: scanmap replay {path}")
-    except OSError as error:
+    except BaseException as error:  # Ctrl-C too: half a file would pass for a whole one
         out.unlink()
-        raise RecordingError(f"recording {out} cannot be written: {error.strerror or error}") from error
-    except RecordingError:
-        out.unlink()
+        if isinstance(error, OSError):
+            raise RecordingError(f"recording {out} cannot be written: {error.strerror or error}") from error
         raise
     finally:
         target.close()

@@ -80,7 +80,7 @@ def evaluate(
         alpha_deg=float(np.degrees(head.alpha)), size=(own.width, own.height), nearest_m=float(nearest),
         farthest_m=float(farthest), column_infinity=_infinity(head, row), columns_used=float(window[1] - window[0]),
         view_up_deg=up, view_down_deg=down, rows_per_deg=rows_per_deg, ranges_m=ranges, column=at, step_m=step,
-        sigma_m=step * sigma_px, model_error=_model_error(head, column, row, distance),
+        sigma_m=step * sigma_px, model_error=_model_error(head, column, row),
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def _upright_view(head: Calibration, limits: TriangulationParams, distance_m: fl
     return float(known.max()), float(-known.min()), float((known.size - 1) / max(np.ptp(known), 1e-9))
 
 
-def _model_error(head: Calibration, column: Array, row: float, distance: Array) -> str:
+def _model_error(head: Calibration, column: Array, row: float) -> str:
     """How far Algorithms 1 and 2 are off this head between 0.3 and 3 m."""
     words = []
     for model in ("ratio", "pixel_angle"):
