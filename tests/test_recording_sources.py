@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,10 @@ from recorded_shots import CALIBRATION, START_NS, made_up_shots, record
 
 from scanmap.errors import ConfigError, RecordingError, ScanmapError
 from scanmap.recording import RecordingParams, describe, open_source
+from scanmap.rig.camera import CameraParams
+from scanmap.rig.camera_files import open_files
 from scanmap.shot import Shot, decode_image, encode_png, image_format
+from scanmap.solvers.pictures import Picture, read_pictures
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -238,6 +243,32 @@ def test_a_video_with_one_bearing_a_frame(video: Path, tmp_path: Path, header: s
     shots = list(open_source(video, bearings=csv).shots())
     assert [frame_of(s.image) for s in shots] == list(range(10))
     assert np.allclose([s.bearing for s in shots], np.radians(np.arange(10)))
+
+
+def test_a_mark_that_a_video_was_taken_upside_down_turns_no_frame(tmp_path: Path) -> None:
+    """Phones write it; the pictures of the calibration were not turned by theirs, and must fit these."""
+    path = tmp_path / "v.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 5, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no mp4v video")
+    frame = np.zeros((48, 64, 3), np.uint8)
+    frame[:24, :32] = 250
+    for _ in range(3):
+        writer.write(frame)
+    writer.release()
+    data = path.read_bytes()
+    upright = struct.pack(">9I", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    at = data.index(upright, data.index(b"tkhd"))
+    turned = struct.pack(">9I", 0xFFFF0000, 0, 0, 0, 0xFFFF0000, 0, 64 << 16, 48 << 16, 1 << 30)
+    path.write_bytes(data[:at] + turned + data[at + len(turned) :])
+    path.with_suffix(".csv").write_text("frame,bearing_deg\n1,10\n")
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_ORIENTATION_META) == 180
+    (shot,) = open_source(path).shots()
+    with closing(open_files(CameraParams(source=str(path)))) as camera:
+        live = camera.newest().image
+    first = next(picture for picture in read_pictures(path) if isinstance(picture, Picture))
+    for image in (decode_image(shot.image).image, decode_image(live).image, first.image):
+        assert image[10, 10].min() > 200 and image[-10, -10].max() < 50
 
 
 def test_a_video_that_is_shorter_than_its_csv(video: Path) -> None:

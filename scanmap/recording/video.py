@@ -67,11 +67,22 @@ def _by_frame(table: Path, rows: list[Row]) -> dict[int, Row]:
     return by_frame
 
 
-def _opened(path: Path) -> cv2.VideoCapture:
-    """The video; one that is a row of JPEGs hands out those as they are, any other its decoded frames."""
+def open_video(path: Path) -> cv2.VideoCapture:
+    """A video whose frames come as the sensor read them: a phone's mark that they are turned is not heeded.
+
+    Raises:
+        RecordingError: it cannot be opened.
+    """
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise RecordingError(f"video {path} cannot be opened: no video, damaged, or a codec that OpenCV lacks")
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture
+
+
+def _opened(path: Path) -> cv2.VideoCapture:
+    """The video; one that is a row of JPEGs hands out those as they are, any other its decoded frames."""
+    capture = open_video(path)
     if int(capture.get(cv2.CAP_PROP_FOURCC)) != cv2.VideoWriter.fourcc(*"MJPG"):
         return capture
     packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])

@@ -107,6 +107,7 @@ def _of_video(path: Path) -> Iterator[bytes]:
     if not is_jpeg:
         capture.release()
         capture = cv2.VideoCapture(str(path))
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor read it, like a phone's pictures
     try:
         if not capture.isOpened():
             raise CameraError(f"video {path} cannot be opened: no video, damaged, or a codec that OpenCV lacks")

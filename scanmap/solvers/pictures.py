@@ -15,7 +15,7 @@ from scanmap.errors import CalibrationError, CameraError, ConfigError, Recording
 from scanmap.laserline import Rounding, rounding_of
 from scanmap.recording import open_source
 from scanmap.recording.frames import SUFFIXES
-from scanmap.recording.video import VIDEO_SUFFIXES
+from scanmap.recording.video import VIDEO_SUFFIXES, open_video
 from scanmap.shot import Image, Shot, decode_image
 from scanmap.solvers.board import Board
 from scanmap.solvers.coverage import apart, is_new
@@ -206,9 +206,7 @@ def _decoded(files: list[Path]) -> Iterator[Picture | Rejected]:
 
 
 def _of_video(path: Path) -> Iterator[Picture]:
-    capture = cv2.VideoCapture(str(path))
-    if not capture.isOpened():
-        raise RecordingError(f"video {path} cannot be opened: no video, damaged, or a codec that OpenCV lacks")
+    capture = open_video(path)
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     every = max(1, count // VIDEO_PICTURES)
     number = 0
