@@ -217,6 +217,17 @@ def test_tubes_brighter_than_the_line_cost_few_points() -> None:
     assert scan.valid.sum() > 0.93 * clean
 
 
+def test_rows_that_one_picture_left_open_are_told_by_the_others() -> None:
+    """Above and below a short tube the line is seen: that one of the two is not the line, a picture knows by itself."""
+    scan, second, shots = swept(head(), [tube(0.6, 1.9, -0.15, 0.15), tube(0.1, 1.8, -0.15, 0.15)])
+    left_open = scan.reason == Reason.RIVALS
+    assert left_open.sum() > 300
+    assert off_the_wall(scan).sum() < 0.02 * scan.valid.sum()
+    second.settle(scan, lambda: shots)
+    assert scan.valid[left_open].mean() > 0.9
+    assert off_the_wall(scan).sum() < 0.01 * scan.valid.sum()
+
+
 def test_without_the_pictures_points_are_given_up() -> None:
     scan, second, _ = swept(head(), [tube(0.6, 1.9), tube(0.1, 1.8)])
     before, false = int(scan.valid.sum()), int(off_the_wall(scan).sum())

@@ -27,6 +27,7 @@ from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, fit_gaussian, judged
 from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
+from scanmap.laserline.rivals import contested
 from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
 from scanmap.laserline.search import Course, search
@@ -213,6 +214,8 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
         own = slice(k * height, (k + 1) * height)
         if gaps[k]:
             _go_on(one, doubts.of(own), picture, params, (window[own], free[own]), still)
+    if sight.off is None and still is None:
+        line = without(line, contested(line.column_px, course.places, sight), Reason.RIVALS)
     weak = line.sigma_px > _WEAK_PX
     if sight.off is not None:
         line, weak = told_from_edges(line, weak, sight)

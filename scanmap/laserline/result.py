@@ -27,6 +27,7 @@ class Reason(IntEnum):
     NOT_SCANNED = 10  # no shot covers this cell
     NARROW = 11  # narrower than any line: hot pixels, a bad sensor column
     MIRROR = 12  # seen in a mirror: the image of a point elsewhere in the room
+    RIVALS = 13  # another thing in the same row may be the line as well
 
     @property
     def words(self) -> str:
@@ -48,6 +49,7 @@ _WORDS = {
     Reason.NOT_SCANNED: "not scanned",
     Reason.NARROW: "too narrow for the line",
     Reason.MIRROR: "seen in a mirror",
+    Reason.RIVALS: "one of several alike",
 }
 
 

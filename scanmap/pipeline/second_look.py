@@ -100,7 +100,10 @@ class SecondLook:
                 known = known._replace(still=self._shown(scan, views, shots()), shown=True)
             wrong = self._wrong(scan, asked, views if suspect else [], known)
             total += int(wrong.sum())
-            self._look_again(scan, wrong, wrong.sum(axis=1) >= _LEAST_ROWS, known, shots)
+            again = wrong.sum(axis=1) >= _LEAST_ROWS
+            if known.shown and known.neighbours is None:
+                again[views] |= self._open(scan, views)
+            self._look_again(scan, wrong, again, known, shots)
             if not views or (known.neighbours is not None and not wrong.any()):
                 break
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
@@ -110,7 +113,15 @@ class SecondLook:
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
         """Whether what was taken for the line in one of the views may be among the things that were listed."""
+        if ((scan.reason[views] == Reason.RIVALS).sum(axis=1) >= _LEAST_ROWS).any():
+            return True
         return any(self._stands(scan, k, known, _SUSPECT).sum() >= _LEAST_ROWS for k in views)
+
+    def _open(self, scan: Scan, views: list[int]) -> Mask:
+        """Which of the views leave the line open in many rows: it may be plain once what stands still is masked."""
+        reason = scan.reason[views]
+        rivals, doubtful = ((reason == why).sum(axis=1) for why in (Reason.RIVALS, Reason.AMBIGUOUS))
+        return np.asarray((rivals >= _LEAST_ROWS) | (doubtful >= _WORTH_ROWS))
 
     def _wrong(self, scan: Scan, asked: list[int], views: list[int], known: _Known) -> Mask:
         """The cells (B, H) that show another thing than the line."""
