@@ -54,6 +54,22 @@ def test_sigma_is_honest_and_pooling_pays_in_a_jpeg(colour, quality, subsampling
     assert 0.8 <= np.nanstd(scaled) <= 1.2
 
 
+@pytest.mark.parametrize(("laser", "limit"), [(RED, 0.085), (GREEN, 0.056)], ids=["red", "green"])
+def test_with_a_laser_off_frame_the_neighbouring_channel_tells_of_the_place_too(laser, limit):
+    """Limits: RMS of each row alone [px]; by the laser's own channel, less the laser-off frame's, 0.106 and 0.062."""
+    off, scaled = [], []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        image, truth = clean(LineSpec(height=600, width=800, colour=laser, peak=120.0, sigma=1.0), rng)
+        dark = np.clip(np.rint(image.min(axis=1).mean() + 3.0 + 3.0 * rng.standard_normal(image.shape)), 0, 255)
+        line = find_laser_line(compressed(image, 85, "420"), ALONE, compressed(dark.astype(np.uint8), 85, "420"))
+        off.append(line.column_px - truth)
+        scaled.append(off[-1] / line.sigma_px)
+    assert np.isfinite(off).mean() >= 0.999
+    assert np.sqrt(np.nanmean(np.square(off))) <= limit
+    assert 0.8 <= np.nanstd(scaled) <= 1.2
+
+
 @pytest.mark.parametrize("laser", [RED, GREEN], ids=["red", "green"])
 def test_a_line_is_seen_in_its_own_colour_in_a_grey_room(laser):
     """Compressed, an even grey room has no trace of colour but the line."""

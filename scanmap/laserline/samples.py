@@ -102,6 +102,7 @@ def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
         y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
     else:
         y = strips(lit, row, column, REACH)
+        beside = None if sight.beside is None else strips(sight.beside, row, column, REACH)
     bright = y if seen is lit else strips(seen, row, column, REACH)
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]

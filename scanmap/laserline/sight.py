@@ -66,6 +66,9 @@ class Sight(NamedTuple):
     mixtures: Sequence[Mixture]  # (P,) of the image's channels that the line is placed in
     roundings: Sequence[Rounding | None]  # (P,) of the files that the pictures were
     gain: float = 1.0  # that the laser-off frame's exposure is matched by
+    beside: U8 | None = (
+        None  # (H, W) what the laser added in the neighbouring channel, where that knows more of the place
+    )
 
     @property
     def large(self) -> bool:
@@ -122,14 +125,20 @@ def sight_of(
         mixtures = [_mixture(image[k : k + height], channel, own, rounding, noises) for k, own, rounding in each]
         return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
-    off, gain = None, 1.0
+    off, beside, gain = None, None, 1.0
     if background is not None:
         off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
     rows = np.ascontiguousarray(quick_rows(lit, height))
     noise = _noises(lit, rows, height)
     mixtures = [Mixture(-1 if channel is None else channel)] * len(noise)
-    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain)
+    if background is not None and channel is not None:
+        mixture = _mixture(image, channel, float(noise[0]), roundings[0], noises)
+        if mixture.channel >= 0:
+            on_beside, off_beside = (extract(picture, NEIGHBOUR[channel]) for picture in (image, background))
+            off_beside, gain_beside = at_exposure(on_beside, off_beside)
+            beside, mixtures = without_background(on_beside, off_beside, gain=gain_beside), [mixture]
+    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain, beside)
 
 
 def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
