@@ -461,7 +461,7 @@ def test_nobody_there(device: FakeDevice, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_an_empty_folder_and_the_end_of_one(tmp_path: Path, frames: Callable[[], bytes]) -> None:
-    with pytest.raises(CameraError, match="no more pictures"):
+    with pytest.raises(CameraError, match=r"no pictures \(\.jpg, \.jpeg, \.png\) in it; name their folder"):
         open_camera(CameraParams(source=str(tmp_path)))
     (tmp_path / "a.jpg").write_bytes(frames())
     with opened(CameraParams(source=str(tmp_path))) as camera:

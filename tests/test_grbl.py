@@ -458,6 +458,9 @@ def test_auto_names_what_it_tried(monkeypatch: pytest.MonkeyPatch, uno: Uno) -> 
     stage.close()
     with pytest.raises(StageError, match=r"/dev/nothing.*cannot be opened"):
         open_grbl(StageParams(port="/dev/nothing"))
+    with pytest.raises(StageError, match=r"refused; is the board on, and on this network") as refused:
+        open_grbl(StageParams(port="socket://127.0.0.1:1"))
+    assert str(refused.value).count("socket://") == 1 and "cable" not in str(refused.value)
     assert not board.laser_on
 
 

@@ -96,7 +96,11 @@ def open_files(params: CameraParams) -> FileCamera:
 
 
 def _of_folder(path: Path) -> Iterator[bytes]:
-    for file in sorted(entry for entry in path.iterdir() if entry.suffix.lower() in SUFFIXES):
+    files = sorted(entry for entry in path.iterdir() if entry.suffix.lower() in SUFFIXES)
+    if not files:
+        kinds = ", ".join(SUFFIXES)
+        raise CameraError(f"camera.source = {str(path)!r}: no pictures ({kinds}) in it; name their folder")
+    for file in files:
         yield file.read_bytes()
 
 

@@ -146,6 +146,9 @@ def _why_not_open(url: str, error: Exception) -> str:
         why = f"you may not use it: join its group `{group}` (`sudo usermod -aG {group} $USER`) and log in again"
     elif number in (errno.EBUSY, errno.EAGAIN) or "lock" in text or "busy" in text:
         why = "another program holds it (Arduino IDE, ModemManager, a second scanmap?): close that one"
+    elif "://" in url:
+        text = text.removeprefix(f"Could not open port {url}: ")
+        why = f"{text}; is the board on, and on this network, and its address in stage.port right?"
     else:
         found = ", ".join(serial_devices()) or "none; plug the board in, with a cable that carries data"
         missing = number == errno.ENOENT or "FileNotFound" in text
