@@ -47,7 +47,8 @@ def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
         limits: first and last column (N,) that a block's line can have, NaN where it can have none.
     """
     # One picture after the other: all of them together would not fit into the processor's cache.
-    return Leads(*(np.stack(values) for values in zip(*(_leads_of_one(r, limits) for r in rows), strict=True)))
+    each = zip(*(_leads_of_one(own, limits) for own in rows), strict=True)
+    return Leads(*(np.concatenate(values).reshape(len(rows), -1) for values in each))
 
 
 def _leads_of_one(rows: U8, limits: tuple[F64, F64]) -> Leads:
@@ -135,7 +136,9 @@ def _halved(values: U8 | U16) -> U16:
         return sums
     if values.flags.c_contiguous and even == values.shape[1]:
         both = values.view(np.uint32)
-        return ((both >> 16) + (both & 0xFFFF)).astype(np.uint16)
+        high = both >> 16
+        high += both  # its lower half is the sum of both
+        return high.astype(np.uint16)
     return np.add(values[:, 0:even:2], values[:, 1:even:2], dtype=np.uint16)
 
 

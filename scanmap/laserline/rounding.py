@@ -141,7 +141,7 @@ def shared_px(
         np.clip(np.rint(_STEPS * np.log2(np.fmax(v, 0.1) / first)), 0, n - 1).astype(np.intp)
         for v, first, n in ((width, _WIDTHS[0], len(_WIDTHS)), (height, _HEIGHTS[0], len(_HEIGHTS)))
     ]
-    shared: F32 = table[:, at[0], at[1]]
+    shared: F32 = table.reshape(2, -1).take(at[0] * len(_HEIGHTS) + at[1], axis=1)
     return shared
 
 

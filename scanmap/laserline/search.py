@@ -62,10 +62,11 @@ def search(sight: Sight, window: F64, min_snr: float, still: Mask | None = None)
     quick = _settled(sight, window, min_snr)
     good = quick.candidates.snr[..., 0] > 0
     column, places = np.empty(good.shape, np.float32), list[F32]()
-    for k, (picture, settled_blocks) in enumerate(zip(sight.pictures(), good, strict=True)):
+    for k, settled_blocks in enumerate(good):
         found = Candidates(quick.candidates.column[k], quick.candidates.snr[k])
         rest, score = (~settled_blocks).nonzero()[0], found.snr
         if rest.size:
+            picture = sight.picture(k)
             found = _with_blocks(found, rest, _all_candidates(picture, rest, window, min_snr))
             score = _scores(picture, found, quick.shares[k])
         column[k] = choose_path(found, score, min_snr)

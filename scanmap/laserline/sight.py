@@ -77,20 +77,22 @@ class Sight(NamedTuple):
 
     def pictures(self) -> Iterator[Sight]:
         """Each picture by itself."""
-        for k in range(len(self.noise)):
-            own = slice(k * self.height, (k + 1) * self.height)
-            on, plane, lit, image = (None if v is None else v[own] for v in (self.on, self.plane, self.lit, self.image))
-            assert on is not None and plane is not None and lit is not None
-            one = slice(k, k + 1)
-            yield self._replace(
-                on=on,
-                plane=plane,
-                lit=lit,
-                image=image,
-                noise=self.noise[one],
-                mixtures=self.mixtures[one],
-                roundings=self.roundings[one],
-            )
+        return map(self.picture, range(len(self.noise)))
+
+    def picture(self, k: int) -> Sight:
+        """The k-th picture by itself."""
+        own, one = slice(k * self.height, (k + 1) * self.height), slice(k, k + 1)
+        on, plane, lit, image = (None if v is None else v[own] for v in (self.on, self.plane, self.lit, self.image))
+        assert on is not None and plane is not None and lit is not None
+        return self._replace(
+            on=on,
+            plane=plane,
+            lit=lit,
+            image=image,
+            noise=self.noise[one],
+            mixtures=self.mixtures[one],
+            roundings=self.roundings[one],
+        )
 
 
 def sight_of(
