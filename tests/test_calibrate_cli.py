@@ -73,7 +73,9 @@ def test_scale_makes_a_calibration_for_a_binned_picture(run: Run) -> None:
     code, _, err = run("calibrate", "scale", "calibration.toml", "--size", "800x450", "--out", "cropped.toml")
     assert code == 1
     assert "another aspect" in err
-    assert run("calibrate", "scale", "calibration.toml", "--size", "big", "--out", "x.toml")[0] == 2
+    for size in ("big", "800", "4x3", "16x99999999999"):
+        code, _, err = run("calibrate", "scale", "calibration.toml", "--size", size, "--out", "x.toml")
+        assert code == 2 and f"--size {size}: not WIDTHxHEIGHT" in err
 
 
 def test_a_scan_refuses_a_calibration_without_a_laser_plane(run: Run) -> None:

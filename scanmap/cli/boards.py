@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from scanmap.cli.calibrating import CalibrationOut
+from scanmap.cli.settings import size_of
 
 
 def board(
@@ -50,12 +51,9 @@ def scale(
     from scanmap.calibration import Calibration
     from scanmap.calibration.keeping import refuse_path, save_beside
     from scanmap.cli.terminal import say, say_written
-    from scanmap.errors import ConfigError
 
-    width, x, height = size.partition("x")
-    if not (x and width.isdecimal() and height.isdecimal() and 16 <= min(int(width), int(height)) <= 20000):
-        raise ConfigError(f"--size {size} is no size; write it as 800x600")
+    width, height = size_of("--size", size)
     refuse_path(out)
-    kept = save_beside(Calibration.load(file).rescaled(int(width), int(height)), out)
+    kept = save_beside(Calibration.load(file).rescaled(width, height), out)
     say_written(out, kept)
     say("it holds only if the camera shows the same field of view at both sizes: compare two pictures")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scanmap.cli.settings import CalibrationOption, SetOption
+from scanmap.cli.settings import CalibrationOption, SetOption, size_of
 
 if TYPE_CHECKING:
     from scanmap.calibration import Calibration
@@ -60,15 +60,14 @@ def design(
     from scanmap.solvers.design_figures import draw_designs
 
     refuse_file("--out", out, ".png")
-    size = _size(image)
+    size = None if image is None else size_of("--image", image)
     short = {"baseline_m": None if baseline_mm is None else baseline_mm / 1e3, "beta_deg": beta_deg,
              "alpha_deg": alpha_deg}  # fmt: skip
     heads = [_head(name, set_, calibration, short, size) for name in config or ["twin-room"]]
     if not config and heads[0][0].endswith("*"):
         heads = [("as given", *heads[0][1:])]
-    designs = [evaluate(name, head, own.triangulation, sigma_px) for name, head, own in heads]
-    if len(designs) > 1:  # one column of ranges for all
-        designs = [evaluate(name, head, own.triangulation, sigma_px, np.array(RANGES_M)) for name, head, own in heads]
+    ranges_m = np.array(RANGES_M) if len(heads) > 1 else None  # one column of ranges for all
+    designs = [evaluate(name, head, own.triangulation, sigma_px, ranges_m) for name, head, own in heads]
     _print_heads(designs, [own for _, _, own in heads], _wall(wall))
     _print_ranges(designs, sigma_px)
     for one in designs:
@@ -108,17 +107,6 @@ def _head(
             raise ConfigError(f"no head can be made of {given}: {error}") from error
         shown += "*"
     return shown, head, own
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    from scanmap.errors import ConfigError
-
-    if text is None:
-        return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and 8 <= int(width) <= 20000 and 8 <= int(height) <= 20000):
-        raise ConfigError(f"--image {text}: not WIDTHxHEIGHT in pixels; try --image 1920x1080")
-    return int(width), int(height)
 
 
 def _wall(text: str) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""`scanmap config`: the effective configuration."""
+"""`scanmap config`: the effective configuration; and what options of several commands mean."""
 
 from __future__ import annotations
 
@@ -27,3 +27,13 @@ def config(config: ConfigOption = None, set_: SetOption = None) -> None:
     from scanmap.config import load
 
     output.write(load(config, set_ or ()).explained())
+
+
+def size_of(option: str, text: str) -> tuple[int, int]:
+    """Width and height [px] of `1920x1080`; ConfigError where it is none."""
+    from scanmap.errors import ConfigError
+
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 8 <= int(width) <= 20000 and 8 <= int(height) <= 20000):
+        raise ConfigError(f"{option} {text}: not WIDTHxHEIGHT, 8 to 20000 pixels each; try {option} 1920x1080")
+    return int(width), int(height)
