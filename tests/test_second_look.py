@@ -254,23 +254,37 @@ def test_the_order_of_the_shots_does_not_matter() -> None:
     np.testing.assert_array_equal(one.merged().points, other.merged().points)
 
 
+def odd_pictures(height: float, width: float, count: int) -> tuple[Scan, SecondLook, list[Shot]]:
+    """A sweep with pictures side by side in which there is another thing than the line, where 0.2 m would be."""
+    calibration, k, rows = head((0.0, 0.0, 0.0)), 8, slice(60, 180)
+    scan, second, shots = swept(calibration, [])
+    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
+    rng = np.random.default_rng(5)
+    for i in range(count):
+        picture = rng.normal(20.0, 2.0, (HEIGHT, WIDTH))
+        picture[rows] += height * np.exp(-0.5 * ((np.arange(WIDTH) - 560.0) / width) ** 2)
+        image = bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
+        shots.append(Shot(99 + i, float(BEARINGS[k] + (0.5 + 0.2 * i) * STEP), 0.0, 99.0 + i, image, None))
+        step = pipeline.process(shots[-1])
+        assert np.isfinite(step.profile.range_m[rows]).mean() > 0.9
+        assert np.nanmax(step.profile.range_m) < 0.4
+        scan.add(step.profile, shots[-1].bearing)
+        second(step)
+    return scan, second, shots
+
+
 @pytest.mark.parametrize("lit", [False, True])
 def test_what_returns_less_light_than_any_surface_is_not_the_line(lit: bool) -> None:
     """A dim thing in one picture only, where the line is lost, at a column that means 0.3 m."""
-    calibration = head((0.0, 0.0, 0.0))
-    scan, second, shots = swept(calibration, [])
-    k, rows = 8, slice(60, 180)
-    rng = np.random.default_rng(5)
-    picture = rng.normal(20.0, 2.0, (HEIGHT, WIDTH))
-    height = 180.0 if lit else 25.0
-    picture[rows] += height * np.exp(-0.5 * ((np.arange(WIDTH) - 560.0) / (4.0 if lit else 1.2)) ** 2)
-    image = bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
-    odd = Shot(99, float(BEARINGS[k] + 0.5 * STEP), 0.0, 99.0, image, None)
-    pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
-    step = pipeline.process(odd)
-    assert np.isfinite(step.profile.range_m[rows]).mean() > 0.9
-    assert np.nanmax(step.profile.range_m) < 0.4
-    scan.add(step.profile, odd.bearing)
-    second(step)
-    second.settle(scan, lambda: [*shots, odd])
+    scan, second, shots = odd_pictures(180.0 if lit else 25.0, 4.0 if lit else 1.2, 1)
+    second.settle(scan, lambda: shots)
     assert scan.valid[-1].any() == lit
+
+
+@pytest.mark.parametrize("side_by_side", [1, 2])
+def test_what_returns_little_light_is_the_line_where_a_neighbour_goes_on(side_by_side: int) -> None:
+    """0.005 of what is usual: a black thing, or nothing."""
+    scan, second, shots = odd_pictures(60.0, 1.5, side_by_side)
+    second.settle(scan, lambda: shots)
+    kept = (scan.range_m[len(BEARINGS) :] < 0.4).sum(axis=1)
+    assert (kept > 100).all() if side_by_side == 2 else not kept.any()

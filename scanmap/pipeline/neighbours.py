@@ -18,6 +18,7 @@ from scanmap.pipeline.still import SHARE
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Counts = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 _FARTHEST = float(np.radians(20.0))  # what lies farther round is no neighbour
 _SAME = float(np.radians(0.02))  # bearings closer than this are one
@@ -44,6 +45,10 @@ class Neighbours(NamedTuple):
             goes_on += near
             elsewhere += np.isfinite(theirs) & ~near
         return goes_on, elsewhere
+
+    def alone(self, k: int, range_m: F32 | F64) -> Mask:
+        """Which points (H,) of bearing `k`, at some ranges [m], no neighbour goes on to, though there is one."""
+        return (self.tell(k, range_m)[0] == 0) & bool(self.beside[k])
 
     def share(self, k: int, range_m: F32 | F64) -> F64:
         """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""
