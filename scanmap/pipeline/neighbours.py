@@ -48,7 +48,8 @@ class Neighbours(NamedTuple):
 
     def alone(self, k: int, range_m: F32 | F64) -> Mask:
         """Which points (H,) of bearing `k`, at some ranges [m], no neighbour goes on to, though there is one."""
-        return (self.tell(k, range_m)[0] == 0) & bool(self.beside[k])
+        goes_on, _ = self.tell(k, range_m)
+        return np.asarray(goes_on == 0) if self.beside[k] else np.zeros(goes_on.shape, bool)
 
     def share(self, k: int, range_m: F32 | F64) -> F64:
         """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""
