@@ -1,5 +1,7 @@
 """`scanmap design` against plain trigonometry."""
 
+import io
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +42,17 @@ def test_numbers_are_those_of_the_triangle(baseline: float, beta: float, alpha: 
     step = baseline / np.sin(angle) ** 2 * np.cos(angle - b) ** 2 / focal
     assert found.step_m[seen] == pytest.approx(step, rel=2e-3)
     assert found.sigma_m[seen] == pytest.approx(0.1 * step, rel=2e-3)
+
+
+def test_tables_are_drawn_with_signs_that_the_reader_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipe on Windows is cp1252: lines of escapes stood there instead of a table."""
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    with pytest.raises(SystemExit) as ended:
+        main(["design", "--config", "wide"])
+    assert ended.value.code == 0
+    said = stdout.buffer.getvalue().decode("cp1252")  # type: ignore[attr-defined]
+    assert "|nearest range m         |       0.200|" in said and "\\u" not in said
 
 
 def test_a_longer_baseline_measures_finer_and_sees_less_near() -> None:

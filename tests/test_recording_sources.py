@@ -41,21 +41,22 @@ def write_folder(folder: Path, csv: str, names: list[str], off: tuple[str, ...] 
 
 def test_a_folder_of_frames_by_name_and_by_number(tmp_path: Path) -> None:
     csv = "frame,bearing_deg,time_s\nstep_num1.jpg,-0.0,0.0\nstep_num2.jpg,-1.125,1.0\n\n7,90,2.5\n8,180,3.5\n"
-    names = ["step_num1.jpg", "step_num2.jpg", "000007.jpg", "000008.png"]
+    csv += "9,185,4.5\n010,190,5.5\n"
+    names = ["step_num1.jpg", "step_num2.jpg", "000007.jpg", "000008.png", "9.JPG", "010.jpeg"]
     folder = write_folder(tmp_path / "scan", csv, names, off=("step_num2.jpg", "000007.jpg"))
     CALIBRATION.save(folder / "calibration.toml")
     source = open_source(folder)
     shots = list(source.shots())
-    assert [s.image for s in shots] == [b"on step_num1.jpg", b"on step_num2.jpg", b"on 000007.jpg", b"on 000008.png"]
-    assert [s.background for s in shots] == [None, b"off step_num2.jpg", b"off 000007.jpg", None]
-    assert np.allclose([s.bearing for s in shots], np.radians([0, -1.125, 90, 180]), rtol=0, atol=1e-15)
+    assert [s.image for s in shots] == [f"on {name}".encode() for name in names]
+    assert [s.background for s in shots[:4]] == [None, b"off step_num2.jpg", b"off 000007.jpg", None]
+    assert np.allclose([s.bearing for s in shots], np.radians([0, -1.125, 90, 180, 185, 190]), rtol=0, atol=1e-15)
     assert [s.bearing_commanded for s in shots] == [s.bearing for s in shots]
-    assert [s.time for s in shots] == [0.0, 1.0, 2.5, 3.5]
-    assert [s.index for s in shots] == [0, 1, 2, 3]
-    assert source.count == 4
-    assert len(source.faults) == 2  # two pictures with the laser off are not there
+    assert [s.time for s in shots] == [0.0, 1.0, 2.5, 3.5, 4.5, 5.5]
+    assert [s.index for s in shots] == [0, 1, 2, 3, 4, 5]
+    assert source.count == 6
+    assert len(source.faults) == 4  # four pictures with the laser off are not there
     assert source.calibration().dumps() == CALIBRATION.dumps()
-    assert (describe(folder).kind, describe(folder).shots, describe(folder).has_calibration) == ("frames", 4, True)
+    assert (describe(folder).kind, describe(folder).shots, describe(folder).has_calibration) == ("frames", 6, True)
 
 
 SPREADSHEETS = {

@@ -25,15 +25,18 @@ class SteadyOutput:
     `error` keeps what happened, unless it was only a reader that had seen enough (`scanmap ... | head`).
     """
 
-    encoding = "utf-8"
-
     def __init__(self) -> None:
         self.silent = False
         self.error: OSError | None = None
 
+    @property
+    def encoding(self) -> str:
+        """What its reader reads; tables are drawn with signs that it has."""
+        return getattr(sys.stdout, "encoding", None) or "utf-8"
+
     def write(self, text: str) -> int:
         """Write, or do nothing where nobody listens."""
-        self._attempt(lambda: sys.stdout.write(printable(text, getattr(sys.stdout, "encoding", None))))
+        self._attempt(lambda: sys.stdout.write(printable(text, self.encoding)))
         return len(text)
 
     def flush(self) -> None:

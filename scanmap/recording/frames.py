@@ -18,8 +18,9 @@ def frames_source(folder: Path) -> Source:
     """Open a folder of frames.
 
     `scan.csv` has the header `frame,bearing_deg,time_s`; a frame is the name of a file in `frames/`, which may
-    stand before it, or a number N for `frames/00000N.jpg` (or .png). The file of the same name in `off/`, if there
-    is one, is the picture with the laser off. `calibration.toml` and `rig.toml` in the folder come along.
+    stand before it, or a number N for `frames/00000N.jpg` or `frames/N.jpg` (or .png). The file of the same name in
+    `off/`, if there is one, is the picture with the laser off. `calibration.toml` and `rig.toml` in the folder
+    come along.
 
     Raises:
         RecordingError: the folder is empty or has no scan.csv, or a file cannot be read.
@@ -69,7 +70,8 @@ def _bytes(folder: Path, row: Row, report: Report) -> bytes | None:
     """The file of a row; a missing or unreadable one is reported."""
     names = [row.frame.removeprefix("frames/")]
     if (number := frame_number(row.frame)) is not None:
-        names += [f"{number:06d}{suffix}" for suffix in SUFFIXES]
+        stems = dict.fromkeys((f"{number:06d}", row.frame))
+        names += [stem + ending for stem in stems for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
     path = next((folder / name for name in names if _is_file(folder / name)), None)
     if path is None:
         report(f"scan.csv line {row.line}: {folder / names[min(1, len(names) - 1)]} is missing and left out")
