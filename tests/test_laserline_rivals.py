@@ -47,6 +47,15 @@ def test_colour_tells_the_line_from_the_gaps_of_a_blind():
     assert false == 0.0
 
 
+@pytest.mark.parametrize("rows", [slice(180, 480), slice(20, 580)])
+def test_more_white_gaps_than_are_listed_hide_no_coloured_line(rows):
+    """They saturate, so that only what is beside them tells that they are white; and all are higher than the line."""
+    frame = blind(True, 1, rows=rows)
+    found, false = score(find_laser_line(frame.image, GAUSS).column_px, frame)
+    assert found >= 0.97
+    assert false == 0.0
+
+
 @pytest.mark.parametrize("colour", [True, False])
 def test_of_a_long_line_and_a_short_piece_of_a_ridge_beside_it_the_line_stays(colour):
     """A thing of the room is dimmer than the line and goes on where that is swallowed: a few rows of it are taken."""

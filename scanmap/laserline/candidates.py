@@ -15,7 +15,7 @@ U16 = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
 BLOCK = 4  # rows summed into one: a quarter of the search, twice the signal to noise
-COUNT = 6  # candidates per block
+COUNT, MANY = 6, 24  # candidates per block, and where most are of another colour
 COLOURLESS = 240  # [grey levels] from here on a sample has no colour
 _PER_LEVEL = (4, 3, 3)  # candidates at each of three resolutions, for lines of sigma 0.7 to 8 px
 _LARGE = 900  # rows from which on half the columns are enough for the finest search
@@ -31,7 +31,7 @@ class _Filter(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Candidates of B blocks, strongest first; arrays (B, COUNT)."""
+    """Candidates of B blocks, strongest first; arrays (B, n)."""
 
     column: F32  # [px] to a pixel or two
     snr: F32  # response over the noise; 0 where there is none
@@ -68,6 +68,7 @@ def find_candidates(
     other: U8 | None = None,
     large: bool = False,
     still: Mask | None = None,
+    count: int = COUNT,
 ) -> Candidates:
     """The strongest narrow bright places of each block of rows.
 
@@ -80,6 +81,7 @@ def find_candidates(
             out there too is a thing, not the line.
         large: half the columns are enough for the finest search.
         still: (B, W) places that are no candidates.
+        count: of each block, COUNT or more.
 
     The response is the mean over the line minus the brighter of its two sides: a wide bright blob and an edge
     have a bright side and score nothing. It is compared in grey levels, not in units of noise: what competes with
@@ -94,7 +96,7 @@ def find_candidates(
     unit = gain * unit_of(noise, large)
     limits = block_window(window)
     columns, snrs = [], []
-    for level, count in enumerate(_PER_LEVEL):
+    for level, few in enumerate(_PER_LEVEL):
         if level:
             own, scale, unit = _halved(own), 2 * scale, 2 * unit
             if elsewhere is not None and saturated is not None:
@@ -116,10 +118,10 @@ def find_candidates(
             across = still[:, : scale * response.shape[1]].reshape(len(still), -1, scale)
             response[across.any(axis=2)] = 0
         around = shape.centre if level else _APART // scale
-        column, value = _strongest(response, count, scale, limits, around, min_snr * unit)
+        column, value = _strongest(response, few * count // COUNT, scale, limits, around, min_snr * unit)
         columns.append(column)
         snrs.append(value / np.float32(unit))
-    return _apart(np.concatenate(columns, axis=1), np.concatenate(snrs, axis=1))
+    return _apart(np.concatenate(columns, axis=1), np.concatenate(snrs, axis=1), count)
 
 
 def unit_of(noise: float, large: bool) -> float:
@@ -218,8 +220,8 @@ def runs_in(response: U16, length: int) -> U16:
     return np.ndarray((blocks, width - length + 1, length), response.dtype, response, 0, (row, step, step))
 
 
-def _apart(column: F32, value: F32) -> Candidates:
-    """The COUNT strongest of all resolutions' candidates (B, n) that are not the same place, strongest first."""
+def _apart(column: F32, value: F32, count: int) -> Candidates:
+    """The `count` strongest of all resolutions' candidates (B, n) that are not the same place, strongest first."""
     order = np.argsort(-value, axis=1, kind="stable")
     column, value = np.take_along_axis(column, order, 1), np.take_along_axis(value, order, 1)
     # Of two equals the finer filter's, which comes first, counts.
@@ -229,8 +231,8 @@ def _apart(column: F32, value: F32) -> Candidates:
         near = np.abs(column[:, k, None] - column[:, :k]) < _APART
         value[:, k] *= ~(near & (value[:, :k] > 0)).any(axis=1)
     if not value[:, 1:].any():
-        return Candidates(column[:, :COUNT], value[:, :COUNT])
-    order = np.argsort(-value, axis=1, kind="stable")[:, :COUNT]
+        return Candidates(column[:, :count], value[:, :count])
+    order = np.argsort(-value, axis=1, kind="stable")[:, :count]
     return Candidates(np.take_along_axis(column, order, 1), np.take_along_axis(value, order, 1))
 
 

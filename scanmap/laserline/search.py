@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import (
     BLOCK,
     COUNT,
+    MANY,
     Candidates,
     block_window,
     find_candidates,
@@ -27,6 +28,8 @@ F32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
+_FULL, _HIGH = 4, 0.5  # candidates of a block, so high beside its highest, from which on there may be more
+_OTHER = 0.5  # of its signal to noise, that a candidate is worth at most if it is of another colour or untold
 _GOES_ON = 0.5  # least height of a line between two places, over the lesser of theirs
 
 
@@ -68,7 +71,7 @@ def search(sight: Sight, window: F64, min_snr: float, still: Mask | None = None)
         if rest.size:
             picture = sight.picture(k)
             found = _with_blocks(found, rest, _all_candidates(picture, rest, window, min_snr))
-            score = _scores(picture, found, quick.shares[k])
+            found, score = _scored(picture, found, quick.shares[k], window, min_snr)
         column[k] = choose_path(found, score, min_snr)
         places.append(np.hstack([_places(found, min_snr), quick.beside[k, :, None]]))
     return Course(column, good, places)
@@ -78,8 +81,8 @@ def _searched(sight: Sight, window: F64, min_snr: float, still: Mask | None) -> 
     """The line's column (B,) in one picture, and all places like it, of all candidates of all blocks."""
     other = None if sight.image is None else blocks_of(sight.image, NEIGHBOUR[sight.channel])
     found = find_candidates(sight.lit, window, float(sight.noise[0]), min_snr, other, sight.large, still)
-    path = choose_path(found, _scores(sight, found, np.full(len(found.snr), np.nan, np.float32)), min_snr)
-    return path, _places(found, min_snr)
+    found, score = _scored(sight, found, np.full(len(found.snr), np.nan, np.float32), window, min_snr, still)
+    return choose_path(found, score, min_snr), _places(found, min_snr)
 
 
 def _places(found: Candidates, min_snr: float) -> F32:
@@ -117,28 +120,49 @@ def _settled(sight: Sight, window: F64, min_snr: float) -> _Quick:
     return _Quick(Candidates(column[..., None], (height / unit)[..., None]), shares, beside)
 
 
-def _all_candidates(sight: Sight, blocks: Index, window: F64, min_snr: float) -> Candidates:
-    """All candidates of some blocks of one large picture."""
+def _all_candidates(
+    sight: Sight, blocks: Index, window: F64, min_snr: float, still: Mask | None = None, count: int = COUNT
+) -> Candidates:
+    """All candidates of some blocks (n,) of one picture."""
+    still = None if still is None else still[blocks]
     rows = np.minimum((blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel(), len(sight.lit) - 1)
     if sight.image is None:
-        return find_candidates(sight.lit[rows], window[rows], float(sight.noise[0]), min_snr, large=True)
+        return find_candidates(
+            sight.lit[rows], window[rows], float(sight.noise[0]), min_snr, None, sight.large, still, count
+        )
     image = sight.image[rows]
     other = blocks_of(image, NEIGHBOUR[sight.channel])
     own = extract(image, sight.channel)
-    return find_candidates(own, window[rows], float(sight.noise[0]), min_snr, other, large=True)
+    return find_candidates(own, window[rows], float(sight.noise[0]), min_snr, other, sight.large, still, count)
 
 
 def _with_blocks(found: Candidates, blocks: Index, more: Candidates) -> Candidates:
-    """Candidates of one place per block, those of some `blocks` replaced by all their places."""
-    column, snr = (np.zeros((len(found.snr), COUNT), np.float32) for _ in range(2))
+    """Candidates, those of some `blocks` replaced by more."""
+    width = max(first.shape[1] for first in (found.snr, more.snr))
+    column, snr = (np.zeros((len(found.snr), width), np.float32) for _ in range(2))
     for whole, first, others in zip((column, snr), found, more, strict=True):
-        whole[:, :1] = first
+        whole[:, : first.shape[1]] = first
+        whole[blocks] = 0.0
         whole[blocks, : others.shape[1]] = others
     return Candidates(column, snr)
 
 
-def _scores(sight: Sight, found: Candidates, shares: F32) -> F32:
-    """The candidates' worth (B, n): their signal to noise, less where the colour is in doubt."""
+def _scored(
+    sight: Sight, found: Candidates, shares: F32, window: F64, min_snr: float, still: Mask | None = None
+) -> tuple[Candidates, F32]:
+    """Candidates and their worth (B, n): their signal to noise, less where the colour is in doubt.
+
+    Where all that were listed of a block are of another colour, as the gaps of a blind, it is asked for more.
+    """
     if sight.image is None:
-        return found.snr
-    return found.snr * colour_doubt(sight.image, sight.channel, found, float(sight.noise[0]), shares)
+        return found, found.snr
+    noise = float(sight.noise[0])
+    score = found.snr * colour_doubt(sight.image, sight.channel, found, noise, shares)
+    listed = found.snr >= min_snr
+    high = listed & (found.snr > _HIGH * found.snr[:, :1])
+    full = (np.count_nonzero(high, axis=1) >= _FULL) & ~(listed & (score > _OTHER * found.snr)).any(axis=1)
+    blocks = full.nonzero()[0]
+    if blocks.size:
+        found = _with_blocks(found, blocks, _all_candidates(sight, blocks, window, min_snr, still, MANY))
+        score = found.snr * colour_doubt(sight.image, sight.channel, found, noise, shares)
+    return found, score
