@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 OutOption = Annotated[
     list[Path] | None,
-    typer.Option("--out", metavar="FILE", help="Cloud (.ply .pcd .xyz) or mesh (.glb .stl, mesh.ply); repeatable."),
+    typer.Option("--out", metavar="FILE", help="Cloud (.ply .pcd .xyz) or mesh (.glb .stl .obj mesh.ply); repeatable."),
 ]
 MapOption = Annotated[Path | None, typer.Option("--map", metavar="F.yaml", help="Occupancy map that Nav2 loads.")]
 RrdOption = Annotated[Path | None, typer.Option("--rrd", metavar="F.rrd", help="rerun recording with our layout.")]
