@@ -37,6 +37,7 @@ def test_board_writes_a_sheet_and_says_what_comes_next(run: Run) -> None:
         (["calibrate", "camera", ".", "--board", "checkers"], 2, "not the name of a board"),
         (["calibrate", "camera", ".", "--board", BOARD, "--out", "c.txt"], 2, "c.toml"),
         (["calibrate", "laser", ".", "--board", BOARD], 2, "scanmap calibrate camera"),
+        (["calibrate", "laser", ".", "--board", BOARD, "--out", "my head.toml"], 2, "--out 'my head.toml' comes first"),
         (["calibrate", "axis", ".", "--board", BOARD], 2, "scanmap calibrate laser"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
+from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption, again
 
 if TYPE_CHECKING:
     from scanmap.calibration import Calibration
@@ -178,7 +179,7 @@ def _base(calibration: str | None, out: Path, before: str) -> Calibration:
     path = Path(calibration) if calibration is not None else out
     if not path.is_file():
         raise ConfigError(
-            f"{path}: no such calibration to go on from; {before} --out {path} comes first, "
+            f"{path}: no such calibration to go on from; {before} --out {shlex.quote(str(path))} comes first, "
             "or give one with --calibration"
         )
     return Calibration.load(path)
@@ -257,4 +258,6 @@ def _run(
         say(f"wrote {path}")
     following = {"camera": "laser", "laser": "axis"}.get(part)
     if following is not None:
-        say(f"next: scanmap calibrate {following} SOURCE --board {what[1]} --out {out}")
+        _, board, config, set_ = what
+        words = f"--board {board} --out {shlex.quote(str(out))}{again(config, set_)}"
+        say(f"next: scanmap calibrate {following} SOURCE {words}")

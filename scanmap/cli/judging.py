@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption
+from scanmap.cli.settings import CalibrationOption, ConfigOption, SetOption, again
 
 if TYPE_CHECKING:
     from scanmap.session.judging import Measured
@@ -78,16 +78,16 @@ def self_(
         heads = (("before", refined.before), ("after", refined.after))
         write_walls(rrd, [in_space(name, head, refined.segments, refined.patches) for name, head in heads])
         say(f"wrote {rrd}")
-    again = f"{shlex.quote(str(recording))}{_again(config, set_)}"
+    of_this = f"{shlex.quote(str(recording))}{again(config, set_)}"
     if not refined.gained:
         say(
             "nothing to gain: the change is within its own sigma, the head is as good as this scan can tell; nothing "
-            f"is written. Use it as it is; scanmap calibrate check {again}{_given(calibration)} judges it"
+            f"is written. Use it as it is; scanmap calibrate check {of_this}{_given(calibration)} judges it"
         )
         return
     kept = write_refined(refined, out, recording, is_twin=is_twin)
     say_written(out, kept)
-    files = f"{again}{_given(str(out))}"
+    files = f"{of_this}{_given(str(out))}"
     say(f"next: scanmap calibrate check {files}")
     say(f"next: scanmap replay {files} --out room.ply")
 
@@ -143,16 +143,10 @@ def check(
     if not judged.passed:
         if judged.refined is not None:
             say(
-                f"next: scanmap calibrate self {shlex.quote(str(recording))}{_again(config, set_)}{_given(calibration)}"
+                f"next: scanmap calibrate self {shlex.quote(str(recording))}{again(config, set_)}{_given(calibration)}"
                 ", or with a board: scanmap calibrate laser"
             )
         raise typer.Exit(1)
-
-
-def _again(config: str | None, set_: list[str] | None) -> str:
-    """The options that a following command needs too."""
-    options = [] if config is None else [f" --config {shlex.quote(config)}"]
-    return "".join([*options, *(f" --set {shlex.quote(one)}" for one in set_ or ())])
 
 
 def _given(calibration: str | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Annotated
 
 import typer
@@ -37,3 +38,9 @@ def size_of(option: str, text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and 8 <= int(width) <= 20000 and 8 <= int(height) <= 20000):
         raise ConfigError(f"{option} {text}: not WIDTHxHEIGHT, 8 to 20000 pixels each; try {option} 1920x1080")
     return int(width), int(height)
+
+
+def again(config: str | None, set_: list[str] | None) -> str:
+    """The options that a following command needs too."""
+    options = [] if config is None else [f" --config {shlex.quote(config)}"]
+    return "".join([*options, *(f" --set {shlex.quote(one)}" for one in set_ or ())])

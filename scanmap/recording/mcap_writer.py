@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import shlex
 import shutil
 import threading
 import time
@@ -265,7 +266,7 @@ class Recorder:
     def _cannot_write(self, error: OSError) -> RecordingError:
         return RecordingError(
             f"recording {self.path} stopped after {self.shots} shots: {error.strerror or error}; they are readable: "
-            f"scanmap replay {self.path}"
+            f"scanmap replay {shlex.quote(str(self.path))}"
         )
 
 

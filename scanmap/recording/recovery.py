@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -48,7 +49,9 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
         if not copy.messages:
             raise RecordingError(f"recording {path} holds no whole message, there is nothing to recover")
         if not copy.lost and not any(found.damaged for found in parts) and len(parts) == 1:
-            raise RecordingError(f"recording {path} is whole, there is nothing to recover: scanmap replay {path}")
+            raise RecordingError(
+                f"recording {path} is whole, there is nothing to recover: scanmap replay {shlex.quote(str(path))}"
+            )
     except BaseException as error:  # Ctrl-C too: half a file would pass for a whole one
         out.unlink()
         if isinstance(error, OSError):

@@ -36,7 +36,9 @@ def describe(path: Path) -> list[str]:
     if not path.exists():
         raise ConfigError(f"{path} does not exist; scanmap info wants {KINDS}")
     if path.suffix.lower() == ".rrd":
-        raise ConfigError(f"{path} is a view, made to be looked at: scanmap view {path}; info wants its recording")
+        raise ConfigError(
+            f"{path} is a view, made to be looked at: scanmap view {shlex.quote(str(path))}; info wants its recording"
+        )
     if path.suffix.lower() in (".pgm", ".png", ".jpg", ".jpeg"):
         raise ConfigError(f"{path} is an image; of a map name the .yaml beside it. scanmap info wants {KINDS}")
     reader = _READERS.get(path.suffix.lower()) if path.is_file() else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,7 +78,7 @@ def earlier_parts(path: Path, settings: tuple[str, ...] = ()) -> Earlier:
         raise ConfigError(f"{path} has no shot from a bearing that can be trusted: scan again")
     done = frozenset(shot.index for shot in source.shots())
     if _is_complete(planned, done, ended=source.end_reason == "finished"):
-        raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {path}")
+        raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {shlex.quote(str(path))}")
     return Earlier(
         source=source,
         landmarks=landmarks,
