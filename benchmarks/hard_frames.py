@@ -32,18 +32,22 @@ from scanmap.triangulation import TriangulationParams, column_window  # noqa: E4
 from scanmap.twin import LightParams, TwinCamera, TwinParams, build_scene  # noqa: E402
 
 U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
 LINE, MISSING = (255, 255, 0), (0, 140, 255)
 PANEL = 330  # [px] square
 
+# Name, and whether in colour.
 SYNTHETIC = (
-    ("stripes", False, "red and white stripes, no off frame"),
-    ("red spines", False, "red spines as high as the line, no off frame"),
-    ("white text", False, "white text, no off frame"),
-    ("tube of light", False, "a tube of light, no off frame"),
-    ("reflection", False, "a second reflection, no off frame"),
-    ("saturated white", False, "a core saturated white, no off frame"),
-    ("steps", False, "depth edges, no off frame"),
-    ("broken", False, "black things swallow the line"),
+    ("stripes", True, "red and white stripes, no off frame"),
+    ("red spines", True, "red spines as high as the line, no off frame"),
+    ("white text", True, "white text, no off frame"),
+    ("tube of light", True, "a tube of light, no off frame"),
+    ("white text", False, "white text in grey, no off frame"),
+    ("tube of light", False, "a tube of light in grey, no off frame"),
+    ("reflection", True, "a second reflection, no off frame"),
+    ("saturated white", True, "a core saturated white, no off frame"),
+    ("steps", True, "depth edges, no off frame"),
+    ("broken", True, "black things swallow the line"),
 )
 # Bearing [deg], picture rows and columns, and what is to be seen.
 TWIN = (
@@ -56,16 +60,17 @@ class Panel(NamedTuple):
     """One picture and its line."""
 
     image: U8  # (h, w, 3) BGR
-    column: NDArray[np.float64]  # (h,) NaN where none
+    column: F64  # (h,) NaN where none
     text: str
 
 
 def synthetic() -> Iterator[Panel]:
     """The hard frames of the tests, cut to the surroundings of their line."""
-    for name, with_off, text in SYNTHETIC:
-        frame = hard_frame(name)
-        line = find_laser_line(frame.image, LaserLineParams(), frame.background if with_off else None)
-        yield _around(frame.image, line.column_px, text, slice(60, 540), 480)
+    for name, colour, text in SYNTHETIC:
+        frame = hard_frame(name, colour=colour)
+        line = find_laser_line(frame.image, LaserLineParams())
+        image = frame.image if colour else cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR)
+        yield _around(np.asarray(image, np.uint8), line.column_px, frame.truth, text, slice(60, 540), 480)
 
 
 def twin() -> Iterator[Panel]:
@@ -81,7 +86,7 @@ def twin() -> Iterator[Panel]:
         state[0] = float(np.radians(bearing))
         image = np.asarray(decode_image(camera.grab().image).image, np.uint8)
         line = find_laser_line(image, LaserLineParams(pool_rows=9), None, window)
-        yield _around(image, line.column_px, text, slice(top, bottom), bottom - top)
+        yield _around(image, line.column_px, line.column_px, text, slice(top, bottom), bottom - top)
 
 
 def pairs(folder: Path) -> Iterator[Panel]:
@@ -92,8 +97,8 @@ def pairs(folder: Path) -> Iterator[Panel]:
         yield Panel(on[:, 40:200], line.column_px - 40, f"pair {number}: {text}, with an off frame")
 
 
-def _around(image: U8, column: NDArray[np.float64], text: str, rows: slice, width: int) -> Panel:
-    left = int(np.clip(np.nanmedian(column[rows]) - width / 2, 0, image.shape[1] - width))
+def _around(image: U8, column: F64, truth: F64, text: str, rows: slice, width: int) -> Panel:
+    left = int(np.clip(np.nanmedian(truth[rows]) - width / 2, 0, image.shape[1] - width))
     return Panel(image[rows, left : left + width], column[rows] - left, text)
 
 

@@ -25,7 +25,7 @@ _TELLING = 5  # that tell how a piece goes on
 _TURNS = 0.3  # what the last of them counts
 _MOST = 0.7  # of a piece's rows looked at
 _RIVAL = 0.3  # of the height of what was taken for the line, that a ridge which goes on beside it has
-_SHORT = 0.2  # of the length of a piece, that what was taken of a ridge beside it is
+_SHORT = 0.15  # of the length of a piece, that what was taken of a ridge beside it is
 _CROWD, _ALIKE = 3, 0.5  # other places in a row that are as high as this part of what was taken
 _COLOUR = 0.25  # by which their share in other channels is larger at most
 
