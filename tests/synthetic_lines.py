@@ -250,6 +250,16 @@ def _stripes(room: Room) -> None:
     ]
 
 
+def _curtain(room: Room) -> None:
+    """Stripes of red and white a few pixels wide, which lean a little; red light hardly tells the two apart."""
+    room.peak[:], room.sigma = 50.0, 1.4
+    x = np.arange(room.width)[None, :] + 0.15 * np.arange(room.height)[:, None]
+    red = ((x // 9) % 2).astype(np.float32)[..., None]
+    cloth = red * np.float32([18.0, 20.0, 75.0]) + (1.0 - red) * np.float32([88.0, 90.0, 92.0])
+    part = (slice(int(0.3 * room.height), int(0.75 * room.height)), slice(int(0.1 * room.width), int(0.9 * room.width)))
+    room.ambient[part] = cv2.GaussianBlur(cloth, (0, 0), 0.8)[part]
+
+
 def _red_ribs(room: Room) -> None:
     """Narrow red ribs on a dark wall: the line's colour and width, half its height."""
     for x in np.linspace(0.1, 0.9, 9) * room.width:
@@ -391,6 +401,7 @@ HARD: dict[str, Callable[[Room], None]] = {
     "lamp over": _lamp_over,
     "small lamps": _lamps_small,
     "stripes": _stripes,
+    "curtain": _curtain,
     "red ribs": _red_ribs,
     "red spines": _spines,
     "tube of light": _tube,
