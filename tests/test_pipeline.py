@@ -138,6 +138,18 @@ def test_cut_jpeg_keeps_the_rows_above_the_cut(pipeline: Pipeline) -> None:
     assert np.abs(step.line.column_px[found] - 120.0).max() < 0.5
 
 
+@pytest.mark.parametrize("damage", ["no picture", "cut", "of another size"])
+def test_a_damaged_laser_off_picture_costs_no_row(pipeline: Pipeline, damage: str) -> None:
+    whole = picture(120.0, jpeg=True)
+    off = bytes(cv2.imencode(".jpg", np.full((H, W, 3), 10, np.uint8))[1])
+    small = bytes(cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1])
+    spoilt = {"no picture": b"nothing", "cut": whole[: len(whole) * 6 // 10], "of another size": small}[damage]
+    step, alone = (pipeline.process(Shot(0, 0.0, 0.0, 0.0, whole, background)) for background in (spoilt, None))
+    assert step.fault.startswith("laser-off picture left out: ")
+    assert np.array_equal(step.line.column_px, alone.line.column_px, equal_nan=True)
+    assert pipeline.process(Shot(0, 0.0, 0.0, 0.0, whole, off)).fault == ""
+
+
 def test_image_of_another_size_is_refused_before_anything_is_processed(pipeline: Pipeline) -> None:
     other = Shot(0, 0.0, 0.0, 0.0, encode_png(np.zeros((48, 64), np.uint8)))
     with pytest.raises(CalibrationError, match=r"64x48.*320x240"):

@@ -75,14 +75,12 @@ class Pipeline:
         """
         try:
             image = self._decode(shot.image)
-            background = self._decode(shot.background) if shot.background is not None else None
         except CameraError as error:
             return self._blind(shot, str(error))
-        dark = background.image if background else None
-        rounding = rounding_of(shot.image)
-        found = look(image.image, self.laserline, dark, self.window, still, self.laser, rounding)
-        rows = min(image.rows_valid, background.rows_valid if background else image.rows_valid)
-        line, fault = _cut(found.line, rows)
+        dark, lacks = self._background(shot)
+        found = look(image.image, self.laserline, dark, self.window, still, self.laser, rounding_of(shot.image))
+        line, cut = _cut(found.line, image.rows_valid)
+        fault = "; ".join(each for each in (cut, lacks) if each)
         return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
 
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
@@ -124,8 +122,7 @@ class Pipeline:
         if self.laserline.grey != "auto":
             return True
         with suppress(CameraError):
-            background = self._decode(shot.background).image if shot.background is not None else None
-            self.laser = laser_of(self._decode(shot.image).image, self.laserline, background)
+            self.laser = laser_of(self._decode(shot.image).image, self.laserline, self._background(shot)[0])
         return self.laser is not None
 
     def ridges(self, shot: Shot) -> NDArray[np.uint8] | None:
@@ -143,6 +140,18 @@ class Pipeline:
         if (width, height) != (own.width, own.height):
             raise CameraError(f"image is {width}x{height}, the calibration is for {own.width}x{own.height}")
         return decoded
+
+    def _background(self, shot: Shot) -> tuple[Image | None, str]:
+        """The laser-off picture, and why there is none: a damaged one is left out, for the line is seen without it."""
+        if shot.background is None:
+            return None, ""
+        try:
+            image, whole = self._decode(shot.background)
+        except CameraError as error:
+            return None, f"laser-off picture left out: {error}"
+        if whole < len(image):
+            return None, f"laser-off picture left out: it is cut, {whole} of {len(image)} rows are whole"
+        return image, ""
 
     def _blind(self, shot: Shot, fault: str) -> Step:
         rows = self.calibration.intrinsics.height
