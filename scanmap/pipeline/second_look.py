@@ -99,7 +99,7 @@ class SecondLook:
             # Most scans of plain rooms need not be read again, nor asked more.
             suspect = shots is None or known.shown or self._suspected(scan, views, known)
             if shots is not None and suspect and not known.shown:
-                known = known._replace(still=self._shown(scan, views, shots()), shown=True)
+                known = known._replace(still=self._shown(views, shots()), shown=True)
             wrong = self._wrong(scan, asked, views if suspect else [], known)
             total += int(wrong.sum())
             again = wrong.sum(axis=1) >= _LEAST_ROWS
@@ -187,7 +187,7 @@ class SecondLook:
         )
         return float(np.median(known)) if known.size else 0.0
 
-    def _shown(self, scan: Scan, views: list[int], shots: Iterable[Shot]) -> StillThings:
+    def _shown(self, views: list[int], shots: Iterable[Shot]) -> StillThings:
         """What the pictures of some bearings show, read once more."""
         still, wanted = StillThings(self._pipeline.calibration), {self._keys[k] for k in views}
         with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="decode") as pool:
