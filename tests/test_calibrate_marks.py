@@ -84,6 +84,19 @@ def test_a_marker_on_the_wall_and_one_hardly_seen_are_left_out() -> None:
     assert follow(still, GUESS, freedom()) is None
 
 
+def test_spoilt_corners_cost_only_themselves() -> None:
+    """One that is found in the wrong place nearly always, one where the lens folds over, a head that never turned."""
+    good, rng = marks(0.2, 5), np.random.default_rng(6)
+    pixel = good.pixel.copy()
+    wild = (good.corner == 3) & (rng.random(len(good.corner)) < 0.9)
+    pixel[wild] += rng.normal(0.0, 12.0, (int(wild.sum()), 2))
+    pixel[(good.corner == 11) & (good.bearing < -3.0)] = np.nan
+    found, exact = follow(good._replace(pixel=pixel), GUESS, freedom()), follow(good, GUESS, freedom())
+    assert found is not None and exact is not None and np.isfinite(found.sigma).all()
+    assert found.change == pytest.approx(exact.change, abs=5e-4)
+    assert follow(good._replace(bearing=np.zeros_like(good.bearing)), GUESS, freedom()) is None
+
+
 def picture(bearing: float, family: int, numbers: tuple[int, ...]) -> bytes:
     """The plate with its markers as the true head sees it, from twice as fine."""
     size = 200

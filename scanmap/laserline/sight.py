@@ -66,9 +66,8 @@ class Sight(NamedTuple):
     mixtures: Sequence[Mixture]  # (P,) of the image's channels that the line is placed in
     roundings: Sequence[Rounding | None]  # (P,) of the files that the pictures were
     gain: float = 1.0  # that the laser-off frame's exposure is matched by
-    beside: U8 | None = (
-        None  # (H, W) what the laser added in the neighbouring channel, where that knows more of the place
-    )
+    # (H, W) what the laser added in the neighbouring channel, where that knows more of the place
+    beside: U8 | None = None
 
     @property
     def large(self) -> bool:

@@ -42,8 +42,7 @@ _KEEP_MEMORY = {
 }
 # The workers are the parallelism; threads that BLAS starts as it is imported cost a fifth of a program's start.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-# The program imports scanmap from where this process did.
-# Importing makes no garbage.
+# It imports scanmap from where this process did; importing makes no garbage.
 _PROGRAM = (
     "import gc; gc.disable(); import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
     "from scanmap.pipeline.starting import begin; begin()"

@@ -28,7 +28,7 @@ Index = NDArray[np.intp]
 FAMILIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
 )  # fmt: skip
-# In so many pictures, and in as many of those with marks, a family is looked for; the pictures lie this far apart.
+# A family is looked for in so many pictures, this far apart.
 LOOKS, LOOK_EVERY = 8, 7
 # A marker must be seen so often to be followed, over such an angle [rad], and lie this near where it is expected [px].
 OFTEN, ARC, NEAR_PX = 12, np.radians(60.0), 15.0
@@ -133,7 +133,8 @@ def follow(marks: Marks, calibration: Calibration, free: Freedom) -> Followed | 
     """
     from scipy.optimize import least_squares
 
-    marks = _turning(marks, calibration)
+    rays = calibration.intrinsics.rays(*marks.pixel.T)
+    marks = _turning(marks.where(np.isfinite(rays[:, 0])), calibration)
     if not len(marks.corner):
         return None
     at = [free.names.index(name) for name in TOLD]
@@ -145,11 +146,16 @@ def follow(marks: Marks, calibration: Calibration, free: Freedom) -> Followed | 
 
     found = least_squares(lambda told: left(told).ravel(), np.zeros(3), x_scale=free.ruler[at], loss="cauchy")
     off = np.hypot(*left(found.x).T)
-    marks = marks.where(off < OUTLIERS * 1.4826 * np.median(off))
+    marks = marks.where(off <= OUTLIERS * 1.4826 * np.median(off))
+    marks = marks.where(np.bincount(marks.corner)[marks.corner] >= OFTEN)
+    if len(np.unique(marks.corner)) <= len(TOLD):
+        return None
     found = least_squares(lambda told: left(told).ravel(), found.x, x_scale=free.ruler[at])
     off = left(found.x)
     # What the detector does to one corner it does in many pictures: each corner is one voice (Huber's sandwich).
     numbers, voice = np.unique(marks.corner, return_inverse=True)
+    if np.linalg.matrix_rank(found.jac) < len(TOLD):
+        return None
     jac = found.jac.reshape(-1, 2, 3)
     sums = np.zeros((len(numbers), 3))
     np.add.at(sums, voice, np.einsum("nki,nk->ni", jac, off))
@@ -162,14 +168,21 @@ def follow(marks: Marks, calibration: Calibration, free: Freedom) -> Followed | 
 
 def _turning(marks: Marks, calibration: Calibration) -> Marks:
     """Those of markers that are seen over an arc and turn about the axis as it is known: not those on the wall."""
-    off = np.hypot(*_left(marks, calibration).T)
-    keep = np.zeros(len(marks.corner), bool)
-    for number in np.unique(marks.corner // 4):
-        here = marks.corner // 4 == number
-        seen = np.sort(np.mod(marks.bearing[here], 2.0 * np.pi))
-        arc = 2.0 * np.pi - float(np.diff(seen, append=seen[0] + 2.0 * np.pi).max())
-        keep |= here & (arc > ARC) & (float(np.median(off[here])) < NEAR_PX)
-    return marks.where(keep)
+    number = marks.corner // 4
+    marks = marks.where(
+        np.isin(number, [each for each in np.unique(number) if _arc(marks.bearing[number == each]) > ARC])
+    )
+    if not len(marks.corner):
+        return marks
+    off, number = np.hypot(*_left(marks, calibration).T), marks.corner // 4
+    near = [each for each in np.unique(number) if float(np.median(off[number == each])) < NEAR_PX]
+    return marks.where(np.isin(number, near))
+
+
+def _arc(bearing: Array) -> float:
+    """The smallest part of a turn that holds all bearings (n,) [rad]."""
+    seen = np.sort(np.mod(bearing, 2.0 * np.pi))
+    return 2.0 * np.pi - float(np.diff(seen, append=seen[0] + 2.0 * np.pi).max())
 
 
 def _left(marks: Marks, head: Calibration) -> Array:
@@ -186,7 +199,8 @@ def _left(marks: Marks, head: Calibration) -> Array:
     depth = np.ones(len(xy))
     for _ in range(2):
         weight = depth[:, None] ** -2
-        square, right = np.zeros((len(numbers), 3, 3)), np.zeros((len(numbers), 3))
+        # What is left of a corner may always stand in one direction, which no inverse survives.
+        square, right = np.tile(1e-12 * np.eye(3), (len(numbers), 1, 1)), np.zeros((len(numbers), 3))
         np.add.at(square, own, np.einsum("nki,nkj->nij", rows * weight[..., None], rows))
         np.add.at(right, own, np.einsum("nki,nk->ni", rows * weight[..., None], rest))
         place = np.linalg.solve(square, right[..., None])[..., 0]
