@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import Laser, LaserLine
+from scanmap.pipeline.handover import Shared
 from scanmap.pipeline.running import run_groups
 from scanmap.pipeline.starting import keep_memory, start
 from scanmap.pipeline.step import Pipeline, Sink, Step
@@ -124,11 +125,12 @@ def _steps(shots: list[Shot], answers: list[Answer]) -> Iterator[Step]:
 
 
 class _Worker:
-    """One worker process and its two pipes."""
+    """One worker process, its two pipes and the memory shared with it."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        self._started = start(pipeline, serve)
-        self._to, self._back = self._started.to, self._started.back
+        self._started = start(pipeline, serve, IN_FLIGHT)
+        self._to, self._back, self._shared = self._started.to, self._started.back, self._started.shared
+        self._asked = 0
         self._sending = threading.Lock()
         self._last_read = threading.Event()
         self._last_read.set()
@@ -139,15 +141,17 @@ class _Worker:
         with self._sending:
             before, read = self._last_read, threading.Event()
             self._last_read = read
+            # No more are on their way than there are slots, and the oldest is answered first.
+            slot = self._asked % IN_FLIGHT
+            self._asked += 1
             try:
-                pickle.dump((laser, shots), self._to, protocol=5)
-                self._to.flush()
+                self._shared.dump((slot, laser, [_sent(shot) for shot in shots]), self._to, slot)
             except BaseException:
                 read.set()
                 raise
         try:
             before.wait()
-            return cast(list[Answer], pickle.load(self._back))
+            return cast(list[Answer], self._shared.load(self._back))
         finally:
             read.set()
 
@@ -159,15 +163,20 @@ class _Worker:
         self._back.close()
 
 
-def serve(pipeline: Pipeline, messages: IO[bytes], answers: IO[bytes]) -> None:
+def serve(pipeline: Pipeline, shared: Shared, messages: IO[bytes], answers: IO[bytes]) -> None:
     """The worker's own loop: messages of shots until the pipe closes."""
     while True:
         try:
-            pipeline.laser, shots = cast(tuple[Laser | None, list[Shot]], pickle.load(messages))
+            slot, pipeline.laser, shots = shared.load(messages)
         except EOFError:
             return
-        pickle.dump(_answers(pipeline, shots), answers, protocol=5)
-        answers.flush()
+        shared.dump(_answers(pipeline, [Shot(*fields) for fields in shots]), answers, slot)
+
+
+def _sent(shot: Shot) -> tuple[object, ...]:
+    """The fields of a shot, its pictures such that they go through shared memory."""
+    pictures = (None if data is None else pickle.PickleBuffer(data) for data in (shot.image, shot.background))
+    return shot.index, shot.bearing, shot.bearing_commanded, shot.time, *pictures
 
 
 def _answers(pipeline: Pipeline, shots: list[Shot]) -> list[Answer]:

@@ -23,13 +23,14 @@ from typing import IO, NamedTuple, cast
 
 import cv2
 
+from scanmap.pipeline.handover import Shared, shared_file
 from scanmap.pipeline.running import single_threaded_opencv
 from scanmap.pipeline.step import Pipeline
 
-Serve = Callable[[Pipeline, IO[bytes], IO[bytes]], None]
+Serve = Callable[[Pipeline, Shared, IO[bytes], IO[bytes]], None]
 
-# What a pipe should hold, where the system lets it: with its usual 64 kB either side waits for the other several times
-# a frame.
+# What a pipe should hold, where the system lets it and there is no shared memory: with its usual 64 kB either side
+# waits for the other several times a frame.
 _PIPE_BYTES = 1 << 20
 PATIENCE_S = 5.0
 # glibc gives large arrays back to the system as they are freed, and asking for them anew costs a fifth of a frame's
@@ -51,17 +52,23 @@ _TASKS = Path("/proc/self/task")  # one entry per thread, on Linux
 
 
 class Started(NamedTuple):
-    """A worker process and its two pipes."""
+    """A worker process, the memory shared with it, and its two pipes."""
 
     pid: int
+    shared: Shared
     to: IO[bytes]
     back: IO[bytes]
     end: Callable[[], int | None]  # waits for it, kills it after PATIENCE_S; its exit code
 
 
-def start(pipeline: Pipeline, serve: Serve) -> Started:
-    """A process that calls `serve` with a pipeline of its own."""
-    started = _copied(pipeline, serve) or _program(pipeline, serve)
+def start(pipeline: Pipeline, serve: Serve, slots: int) -> Started:
+    """A process that calls `serve` with a pipeline of its own, to which `slots` messages may be on their way."""
+    file = shared_file(slots)
+    try:
+        started = _copied(pipeline, serve, file) or _program(pipeline, serve, file)
+    finally:
+        if file is not None:
+            os.close(file)  # what is mapped stays
     for pipe in (started.to, started.back):
         _widen(pipe)
     return started
@@ -74,14 +81,15 @@ def keep_memory() -> None:
             ctypes.CDLL(None).mallopt(number, size)
 
 
-def _copied(pipeline: Pipeline, serve: Serve) -> Started | None:
+def _copied(pipeline: Pipeline, serve: Serve, file: int | None) -> Started | None:
     """A copy of this process; None where other threads may hold what the copy would wait for."""
     with single_threaded_opencv():  # which ends OpenCV's own threads
         if not _is_alone():
             return None
         (read_shots, to), (back, write_answers) = os.pipe(), os.pipe()
+        shared = Shared(file)
         copy = multiprocessing.get_context("fork").Process(
-            target=_serve_copy, args=(pipeline, serve, read_shots, write_answers), daemon=True
+            target=_serve_copy, args=(pipeline, serve, shared, read_shots, write_answers), daemon=True
         )
         copy.start()
     os.close(read_shots)
@@ -93,7 +101,7 @@ def _copied(pipeline: Pipeline, serve: Serve) -> Started | None:
         copy.join()
         return copy.exitcode
 
-    return Started(cast(int, copy.pid), os.fdopen(to, "wb"), os.fdopen(back, "rb"), end)
+    return Started(cast(int, copy.pid), shared, os.fdopen(to, "wb"), os.fdopen(back, "rb"), end)
 
 
 def _is_alone() -> bool:
@@ -101,7 +109,7 @@ def _is_alone() -> bool:
     return _TASKS.is_dir() and len(list(_TASKS.iterdir())) == 1 and not multiprocessing.current_process().daemon
 
 
-def _serve_copy(pipeline: Pipeline, serve: Serve, read_shots: int, write_answers: int) -> None:
+def _serve_copy(pipeline: Pipeline, serve: Serve, shared: Shared, read_shots: int, write_answers: int) -> None:
     """What a copy does instead of going on: nothing of what it was copied with is its own, nor closed by it twice."""
     gc.freeze()
     os.setsid()
@@ -113,20 +121,21 @@ def _serve_copy(pipeline: Pipeline, serve: Serve, read_shots: int, write_answers
                 os.close(file)
     cv2.setNumThreads(1)
     keep_memory()
-    serve(pipeline, os.fdopen(read_shots, "rb"), os.fdopen(write_answers, "wb"))
+    serve(pipeline, shared, os.fdopen(read_shots, "rb"), os.fdopen(write_answers, "wb"))
 
 
-def _program(pipeline: Pipeline, serve: Serve) -> Started:
+def _program(pipeline: Pipeline, serve: Serve, file: int | None) -> Started:
     # A session of its own: Ctrl-C is for this process, which ends its workers when it is done.
     process = subprocess.Popen(
         [sys.executable, "-c", _PROGRAM],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,
+        pass_fds=() if file is None else (file,),
         env=os.environ | _ONE_THREAD | {name: str(size) for (name, _), size in _KEEP_MEMORY.items()},
     )
     to, back = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)
-    for first in (sys.path, serve, pipeline):
+    for first in (sys.path, serve, pipeline, file):
         pickle.dump(first, to, protocol=5)
     to.flush()
 
@@ -137,17 +146,18 @@ def _program(pipeline: Pipeline, serve: Serve) -> Started:
             process.kill()
             return process.wait()
 
-    return Started(process.pid, to, back, end)
+    return Started(process.pid, Shared(file), to, back, end)
 
 
 def begin() -> None:
     """What the program does: it is told by its pipe what to serve, and with which pipeline."""
     cv2.setNumThreads(1)  # the workers are the parallelism
     messages = sys.stdin.buffer
-    serve, pipeline = (pickle.load(messages) for _ in range(2))
+    serve, pipeline, file = (pickle.load(messages) for _ in range(3))
+    shared = Shared(file)
     gc.freeze()  # what was imported is never garbage
     gc.enable()
-    serve(pipeline, messages, sys.stdout.buffer)
+    serve(pipeline, shared, messages, sys.stdout.buffer)
 
 
 def _widen(pipe: IO[bytes]) -> None:
