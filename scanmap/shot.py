@@ -23,6 +23,7 @@ Image = NDArray[np.uint8]
 JPEG_MAGIC = b"\xff\xd8\xff"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_END = b"\xff\xd9"
+_PNG_COLOUR = 25  # byte that tells a PNG's planes: 0 grey, 4 grey and alpha
 
 # Many webcams leave a few stray bytes before a restart marker; the decoder finds its way back there.
 HARMLESS_BYTES = 8
@@ -59,6 +60,19 @@ def image_format(data: bytes) -> str:
     if data.startswith(JPEG_MAGIC):
         return "jpeg"
     return "png" if data.startswith(PNG_MAGIC) else "unknown"
+
+
+def is_grey(data: bytes) -> bool:
+    """Whether an encoded image holds one plane, as monochrome cameras store it; False where its head cannot be read."""
+    kind = image_format(data)
+    if kind == "jpeg":
+        import simplejpeg
+
+        try:
+            return bool(simplejpeg.decode_jpeg_header(data)[2] == "Gray")
+        except ValueError:
+            return False
+    return kind == "png" and data[_PNG_COLOUR : _PNG_COLOUR + 1] in (b"\0", b"\4")
 
 
 def decode_image(data: bytes, *, grey: bool = False, into: Image | None = None) -> Decoded:

@@ -19,8 +19,8 @@ import pytest
 from scanmap.calibration import Calibration, CalibrationFile
 from scanmap.errors import CalibrationError, StageError
 from scanmap.laserline import LaserLineParams, Reason
-from scanmap.pipeline import Pipeline, Processes, Step, checked, run, worth_processes
-from scanmap.shot import Shot, encode_png
+from scanmap.pipeline import Pipeline, Processes, Step, checked, run, step, worth_processes
+from scanmap.shot import Decoded, Image, Shot, decode_image, encode_png
 from scanmap.triangulation import TriangulationParams
 
 W, H = 320, 240
@@ -224,6 +224,40 @@ def test_shots_together_give_what_each_gives_alone(head: Calibration) -> None:
     for k, column in ((0, 100.0), (3, 120.0), (4, 110.0)):
         assert np.nanmedian(steps[k].line.column_px) == pytest.approx(column, abs=0.2)
         assert np.isfinite(steps[k].line.column_px).mean() > 0.98
+
+
+def test_a_monochrome_cameras_pictures_are_decoded_to_their_one_plane(
+    head: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def decode(data: bytes, *, grey: bool, into: Image | None = None) -> Decoded:
+        asked.append(grey)
+        return decode_image(data, grey=grey, into=into)
+
+    monkeypatch.setattr(step, "decode_image", decode)
+    of_colour = [shot.image for shot in shots(3, jpeg=True)]
+    grey = [bytes(cv2.imencode(".jpg", decode_image(data, grey=True).image)[1]) for data in of_colour]
+    source = [Shot(k, 0.0, 0.0, 0.1 * k, image) for k, image in enumerate([*grey, *of_colour])]
+    auto, plane, sum_of_all = (
+        Pipeline(head, LaserLineParams(grey=how), TriangulationParams()) for how in ("auto", "luminance_601", "mean")
+    )
+    for pipeline, some, decoded in (
+        (auto, source[:3], [True] * 3),
+        (auto, source[3:], [False] * 3),
+        (auto, source, [True] * 3 + [False] * 3),  # one by one
+        (plane, source, [True] * 6),
+        (sum_of_all, source[:3], [False] * 3),
+    ):
+        asked.clear()
+        together = pipeline.process_all(some)
+        assert asked == decoded
+        for one, shot in zip(together, some, strict=True):
+            np.testing.assert_array_equal(one.line, pipeline.process(shot).line)
+            assert (one.line.reason == Reason.OK).mean() > 0.99
+    for one, other in zip(auto.process_all(source[:3]), plane.process_all(source[:3]), strict=True):
+        np.testing.assert_array_equal(one.line, other.line)
+    assert auto.ask_laser(source[0]) and auto.laser is None
 
 
 def test_a_picture_that_leaves_doubt_tells_no_channel(head: Calibration) -> None:

@@ -8,7 +8,7 @@ import pytest
 import simplejpeg
 
 from scanmap.errors import CameraError
-from scanmap.shot import decode_image, encode_png
+from scanmap.shot import decode_image, encode_png, is_grey
 
 
 @pytest.mark.parametrize("grey", [False, True])
@@ -44,6 +44,14 @@ def test_a_mark_that_the_picture_stands_on_its_side_turns_no_pixel(kind):
         marked = data[:2] + b"\xff\xe1" + struct.pack(">H", len(chunk) + 2) + chunk + data[2:]
     assert marked != data
     np.testing.assert_array_equal(decode_image(marked).image, decode_image(data).image)
+
+
+def test_files_of_one_plane_are_told_by_their_head():
+    grey = np.full((16, 16), 90, np.uint8)
+    colour = np.repeat(grey[..., None], 3, axis=2)
+    jpegs = [simplejpeg.encode_jpeg(grey[..., None], 90, "GRAY"), simplejpeg.encode_jpeg(colour, 90, "BGR")]
+    assert [is_grey(data) for data in (*jpegs, encode_png(grey), encode_png(colour))] == [True, False, True, False]
+    assert not is_grey(b"") and not is_grey(jpegs[0][:8]) and not is_grey(encode_png(grey)[:20])
 
 
 def test_what_is_no_picture_is_refused():

@@ -25,7 +25,7 @@ from scanmap.laserline import (
     ridges,
     rounding_of,
 )
-from scanmap.shot import Decoded, Image, Shot, decode_image
+from scanmap.shot import Decoded, Image, Shot, decode_image, is_grey
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate, triangulate_all
 
 
@@ -40,6 +40,9 @@ class Step(NamedTuple):
 
 
 Sink = Callable[[Step], None]
+
+# Conversions that give a picture of one plane back as it is.
+_CHANNELS = ("auto", "red", "green", "blue")
 
 
 class Pipeline:
@@ -74,7 +77,7 @@ class Pipeline:
             still: where things of the room are known to be, as `laserline.look` takes it.
         """
         try:
-            image = self._decode(shot.image)
+            image = self._decode(shot.image, self._grey(shot.image))
         except CameraError as error:
             return self._blind(shot, str(error))
         dark, lacks = self._background(shot)
@@ -86,16 +89,17 @@ class Pipeline:
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
         """What `process` gives for each of the shots, bit for bit, sooner."""
         own = self.calibration.intrinsics
-        if len(shots) == 1 or any(shot.background is not None for shot in shots):
+        planes = {self._grey(shot.image) for shot in shots}
+        if len(shots) == 1 or len(planes) > 1 or any(shot.background is not None for shot in shots):
             return [self.process(shot) for shot in shots]
-        stack = _memory((len(shots), own.height, own.width, 3)[: 4 if self.colour else 3])
+        stack = _memory((len(shots), own.height, own.width, 3)[: 3 if planes == {True} else 4])
         rows: list[int] = []  # that are whole, of the pictures that can be read
         roundings: list[Rounding | None] = []
         faults: dict[int, str] = {}
         for k, shot in enumerate(shots):
             own_place = stack[len(rows)]
             try:
-                image, whole = self._decode(shot.image, own_place)
+                image, whole = self._decode(shot.image, planes == {True}, own_place)
             except CameraError as error:
                 faults[k] = str(error)
                 continue
@@ -119,22 +123,26 @@ class Pipeline:
 
     def ask_laser(self, shot: Shot) -> bool:
         """Let a picture tell of the laser; whether it leaves no doubt, or none is needed."""
-        if self.laserline.grey != "auto":
+        if self.laserline.grey != "auto" or self._grey(shot.image):
             return True
         with suppress(CameraError):
-            self.laser = laser_of(self._decode(shot.image).image, self.laserline, self._background(shot)[0])
+            self.laser = laser_of(self._decode(shot.image, False).image, self.laserline, self._background(shot)[0])
         return self.laser is not None
 
     def ridges(self, shot: Shot) -> NDArray[np.uint8] | None:
         """What of a shot's image looks like a line, as `laserline.ridges` has it; None where it cannot be read."""
         try:
-            image = self._decode(shot.image).image
+            image = self._decode(shot.image, self._grey(shot.image)).image
         except CameraError:
             return None
         return ridges(image, self.laserline, self.laser)
 
-    def _decode(self, data: bytes, into: Image | None = None) -> Decoded:
-        decoded = decode_image(data, grey=not self.colour, into=into)
+    def _grey(self, data: bytes) -> bool:
+        """Whether a picture's brightness is all that is asked for, or all there is of its channels."""
+        return not self.colour or (self.laserline.grey in _CHANNELS and is_grey(data))
+
+    def _decode(self, data: bytes, grey: bool, into: Image | None = None) -> Decoded:
+        decoded = decode_image(data, grey=grey, into=into)
         height, width = decoded.image.shape[:2]
         own = self.calibration.intrinsics
         if (width, height) != (own.width, own.height):
@@ -146,7 +154,7 @@ class Pipeline:
         if shot.background is None:
             return None, ""
         try:
-            image, whole = self._decode(shot.background)
+            image, whole = self._decode(shot.background, self._grey(shot.image))
         except CameraError as error:
             return None, f"laser-off picture left out: {error}"
         if whole < len(image):
