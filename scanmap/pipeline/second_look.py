@@ -70,7 +70,7 @@ class SecondLook:
         self._pipeline = pipeline
         self._keys: list[tuple[float, float]] = []
         self._reflectance: list[F32] = []
-        self._ridge: list[F32] = []
+        self._shape: list[F32] = []  # (2, H) height and width of the lines
         self._places: list[F32 | None] = []  # of pictures without laser-off frames: what does not change is gone there
         self._listed_in: list[F32 | None] = []
         self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
@@ -79,7 +79,7 @@ class SecondLook:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
         self._keys.append((step.shot.time, step.shot.bearing))
         self._reflectance.append(_reflectance(step))
-        self._ridge.append(ridge_of(step.line.peak, step.line.width_px).astype(np.float32))
+        self._shape.append(np.array([step.line.peak, step.line.width_px], np.float32))
         places = None if step.fault else step.places
         self._places.append(places if step.shot.background is None else None)
         self._listed_in.append(places)
@@ -163,7 +163,7 @@ class SecondLook:
             column = np.where(share < SHARE, column, np.nan)
             if np.isfinite(column).sum() < _LEAST_ROWS:
                 return np.zeros(scan.rows, bool)
-        return known.still.line(float(scan.bearings[k]), column, self._ridge[k], part * share)
+        return known.still.line(float(scan.bearings[k]), column, ridge_of(*self._shape[k]), part * share)
 
     def _choose(self, scan: Scan, views: list[int], known: _Known, shots: Shots | None) -> None:
         """Look again where the line is listed on the neighbours' course and something else was taken, or nothing."""
@@ -246,7 +246,7 @@ class SecondLook:
                 new = ~scan.valid[k] & (step.profile.reason == Reason.OK)
                 scan.amend(k, new, step.profile)
                 self._reflectance[k][new] = _reflectance(step)[new]
-                self._ridge[k][new] = ridge_of(step.line.peak, step.line.width_px)[new]
+                self._shape[k][:, new] = step.line.peak[new], step.line.width_px[new]
 
         run(wanted(), look, [take])
 
