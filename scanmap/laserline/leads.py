@@ -144,8 +144,8 @@ def _halved(values: U8 | U16) -> U16:
 
 def _stands_out(values: U16) -> U16:
     """Sum over the line's width minus the brighter of its two sides, at least 0, from column _EDGE on."""
-    summed = values[:, :-2] + values[:, 1:-1]
-    summed += values[:, 2:]
+    # OpenCV is twice as quick as NumPy where what it adds is not aligned.
+    summed = cv2.add(cv2.add(values[:, :-2], values[:, 1:-1]), values[:, 2:])
     side = cv2.max(summed[:, : -2 * _AWAY], summed[:, 2 * _AWAY :])
     return np.asarray(cv2.subtract(summed[:, _AWAY:-_AWAY], side), np.uint16)
 
