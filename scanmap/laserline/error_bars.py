@@ -8,11 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.edges import Edges, no_edges
-from scanmap.laserline.pooling import APART_ROWS, moved, pool, segments, unexplained, unexplained_by_height
+from scanmap.laserline.pooling import (
+    APART_ROWS,
+    moved,
+    pool,
+    segments,
+    unexplained,
+    unexplained_by_height,
+    unforeseen,
+)
 from scanmap.laserline.result import LaserLine
 from scanmap.laserline.rounding import hidden_px, shared_px
 from scanmap.laserline.sight import Sight
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 # By what factor the scatter along a line must exceed the sigmas to be believed, and may fall below them once they are
@@ -48,7 +57,8 @@ def with_error_bars(line: LaserLine, sight: Sight, rows: int, doubts: Doubts) ->
     """
     column, peak, width, sigma = (values.reshape(-1, sight.height) for values in line[:4])
     plain = doubts.plain.reshape(-1, sight.height)
-    parts = segments(column, sigma)
+    steps = unforeseen(column)
+    parts = segments(column, sigma, steps)
     more = unexplained_by_height(column, sigma, parts[0], APART_ROWS, peak)
     lag = np.where(np.isfinite(more).any(axis=1), APART_ROWS[0], 0)
     # Sigmas are too large where nothing but the tone curve is wrong; of a file that is not known it may be more.
@@ -57,7 +67,7 @@ def with_error_bars(line: LaserLine, sight: Sight, rows: int, doubts: Doubts) ->
     corrected = (more != 1.0).any(axis=1)
     if corrected.any():
         sigma *= more
-        parts = segments(column, sigma)
+        parts = segments(column, sigma, steps)
     if rows >= 3:
         column, sigma = pool(column, sigma, rows, parts)
         # Errors that are alike in neighbouring rows do not average out as others do.
@@ -65,19 +75,21 @@ def with_error_bars(line: LaserLine, sight: Sight, rows: int, doubts: Doubts) ->
         differ = (corrected & np.isfinite(again)) | (again > _MORE)
         sigma *= np.where(differ, np.minimum(np.maximum(again, _LESS), _MOST), 1.0)[:, None]
         lag = np.where(np.isfinite(again), rows + 1, 0)
+    variance = np.square(sigma).ravel() + np.square(doubts.edges.doubt)
     if known.any():
-        sigma = np.hypot(sigma, _hidden(sight, width, peak, moved(column, parts, lag)))
-    return line._replace(column_px=column.ravel(), sigma_px=np.hypot(sigma.ravel(), doubts.edges.doubt))
+        variance += np.square(_hidden(sight, width, peak, moved(column, parts, lag))).ravel()
+    return line._replace(column_px=column.ravel(), sigma_px=np.sqrt(variance))
 
 
-def _hidden(sight: Sight, width: F64, peak: F64, leans: F64) -> F64:
+def _hidden(sight: Sight, width: F64, peak: F64, leans: F64) -> F32:
     """What rounding does to lines of some widths and heights (P, H) that the scatter along them does not show [px]."""
-    hidden = np.zeros(width.shape)
+    hidden = np.zeros(width.shape, np.float32)
     alike = list(zip(sight.roundings, sight.mixtures, np.round(sight.noise, 1).tolist(), strict=True))
-    for one in set(alike):
+    different = set(alike)
+    for one in different:
         rounding, mixture, noise = one
         if rounding is not None:
-            some = [k for k, other in enumerate(alike) if other == one]
+            some = slice(None) if len(different) == 1 else [k for k, other in enumerate(alike) if other == one]
             shared = shared_px(rounding, mixture, noise, width[some], peak[some])
             hidden[some] = hidden_px(rounding, shared, leans[some])
     return hidden

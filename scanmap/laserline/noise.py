@@ -15,7 +15,7 @@ F64 = NDArray[np.float64]
 _CORE_TAKES = 2.3  # of the four parameters fitted to a profile, a core's samples determine
 _MEDIAN = 0.8  # of what pairs of rows scatter by, over its mean
 _MORE_SCATTER = 1.25  # variance on the line over that of a sample elsewhere, below which speckle is not asked for
-_TELLING_PAIRS = 300
+_TELLING_PAIRS = (75, 300)  # the fewer tell in most pictures that the scatter does not grow at all
 _TELLING = 128  # rows that are enough to say so
 _ROWS_POOLED = 32  # rows over which the noise is taken for the same
 
@@ -76,21 +76,25 @@ def speckle_contrasts(residual: F32, bell: F32, height: F32, weight: F32, rows: 
         scatter, first = np.sort(own[first : first + len(some)]), first + len(some)
         if len(some) and scatter[len(some) // 2] >= _MORE_SCATTER * rows.noise_of[k] ** 2:
             asked.append(k)
-    if asked:
-        contrast[asked] = _speckle_contrasts(
-            residual, bell, height, weight, [rows.parts[k] for k in asked], rows.noise_of[asked]
+    for most in _TELLING_PAIRS if asked else ():
+        told = _speckle_contrasts(
+            residual, bell, height, weight, [rows.parts[k] for k in asked], rows.noise_of[asked], most
         )
+        contrast[asked] = np.nan_to_num(told)
+        asked = [k for k, one in zip(asked, told, strict=True) if one != 0.0]
+        if not asked:
+            break
     return contrast
 
 
 def _speckle_contrasts(
-    residual: F32, bell: F32, height: F32, weight: F32, parts: Sequence[slice], noise: F64
+    residual: F32, bell: F32, height: F32, weight: F32, parts: Sequence[slice], noise: F64, most: int
 ) -> list[float]:
-    """Speckle contrasts of some pictures.
+    """Speckle contrasts of some pictures, by `most` pairs of rows or less than twice as many; NaN of too few.
 
     Differences between rows, because what a profile lacks of a Gaussian is alike in all of them.
     """
-    pairs = [np.arange(p.start, p.stop - 1, max(1, (p.stop - p.start) // _TELLING_PAIRS)) for p in parts]
+    pairs = [np.arange(p.start, p.stop - 1, max(1, (p.stop - p.start) // most)) for p in parts]
     upper = np.concatenate(pairs)
     lower = upper + 1
     step = residual.take(lower, axis=1) - residual.take(upper, axis=1)
@@ -103,7 +107,7 @@ def _speckle_contrasts(
         of, first = slice(first, first + len(own)), first + len(own)
         usable = count[of] >= 2
         if usable.sum() < 20:
-            contrasts.append(0.0)
+            contrasts.append(float("nan"))
             continue
         freedom = np.maximum(count[of][usable] - np.float32(_CORE_TAKES), np.float32(0.5))
         kept = 0.5 * scatter[of][usable] / freedom

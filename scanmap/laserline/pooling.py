@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import cv2
@@ -15,6 +16,7 @@ Index = NDArray[np.intp]
 
 # How far two neighbouring rows' columns may differ beyond the line's own slope: in sigmas, and at least [px].
 _BREAK_SIGMA, _BREAK_PX = 6.0, 0.35
+_FAR_PX = 8.0  # a step that is no slope's
 # A quadratic that misses its own rows by more than this (reduced chi^2) is not what the surface is.
 _MISFIT = 4.5
 # Chi^2 of a bend that is kept by half; rows over which is told what shrinking it leaves of its variance, at least 0.3.
@@ -80,15 +82,16 @@ def unexplained_by_height(column: Array, sigma: Array, start: Index, lags: tuple
     A bright line is no Gaussian after a camera's tone curve, which its own residuals take for noise; a dim one is.
     """
     factor = np.full(column.shape, np.nan)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        octave = np.rint(np.log2(height))
+    octave = np.rint(np.log2(np.maximum(height, 1.0, dtype=np.float32)))
+    lowest, highest = np.fmin.reduce(octave, axis=1), np.fmax.reduce(octave, axis=1)
     for k, told in enumerate(_fourth_differences(column, sigma, start, lags)):
         factor[k] = of_all = _typical([ratio for _, ratio in told])
-        octaves = np.unique(octave[k][np.isfinite(column[k])])
-        for one in octaves if of_all > 0.0 and len(octaves) > 1 else ():
-            some = [ratio[octave[k][at] == one] for at, ratio in told]
+        if not of_all > 0.0 or lowest[k] == highest[k]:
+            continue
+        for one in range(int(lowest[k]), int(highest[k]) + 1):
+            some = [ratio[octave[k, at] == one] for at, ratio in told]
             own, count = _typical(some), min(map(len, some))
-            if np.isfinite(own):
+            if own >= 0.0:
                 factor[k, octave[k] == one] = of_all * (own / of_all) ** (count / (count + TELLING))
     return factor
 
@@ -106,17 +109,21 @@ def _typical(told: list[Array]) -> float:
     """Standard deviation of values whose squares are given, some for each lag, by their medians; NaN of too few."""
     if min(map(len, told)) < TELLING:
         return float("nan")
-    medians = [float(np.partition(ratio, len(ratio) // 2)[len(ratio) // 2]) for ratio in told]
-    return float(np.sqrt(sum(medians) / len(medians) / 0.455))  # the median of chi^2 with one degree of freedom
+    total = 0.0
+    for ratio in told:
+        ordered, middle = ratio.copy(), len(ratio) // 2
+        ordered.partition(middle)
+        total += float(ordered[middle])
+    return math.sqrt(total / len(told) / 0.455)  # the median of chi^2 with one degree of freedom
 
 
 def _fourth_differences(
     column: Array, sigma: Array, start: Index, lags: tuple[int, ...]
-) -> list[list[tuple[Index, Array]]]:
+) -> list[list[tuple[Index | slice, Array]]]:
     """For each picture and lag: middle rows of every other fourth difference, its square over what sigmas expect."""
     pictures, height = column.shape
     variance, start = np.square(sigma), start.reshape(column.shape)
-    told: list[list[tuple[Index, Array]]] = [[] for _ in range(pictures)]
+    told: list[list[tuple[Index | slice, Array]]] = [[] for _ in range(pictures)]
     for lag in lags:
         rows = max(height - 4 * lag, 0)
         a, b, c, d, e = (column[:, k * lag : k * lag + rows : 2] for k in range(5))
@@ -124,16 +131,36 @@ def _fourth_differences(
         step = a + e - 4.0 * (b + d) + 6.0 * c
         ratio = step * step / (va + ve + 16.0 * (vb + vd) + 36.0 * vc)
         one = (start[:, :rows:2] == start[:, 4 * lag : 4 * lag + rows : 2]) & np.isfinite(a)
-        for k in range(pictures):
-            some = one[k].nonzero()[0]
-            told[k].append((2 * (some + lag), ratio[k, some]))
+        for k, whole in enumerate(one.all(axis=1).tolist()):
+            if whole:
+                told[k].append((slice(2 * lag, 2 * lag + rows, 2), ratio[k]))
+            else:
+                some = one[k].nonzero()[0]
+                told[k].append((2 * (some + lag), ratio[k, some]))
     return told
 
 
-def segments(column: Array, sigma: Array) -> tuple[Index, Index]:
-    """First row and end of the segment that each row of pictures (..., H) belongs to, counted through all of them."""
+def segments(column: Array, sigma: Array, steps: Array | None = None) -> tuple[Index, Index]:
+    """First row and end of the segment that each row of pictures (..., H) belongs to, counted through all of them.
+
+    Args:
+        column: (..., H) NaN where a row has no line.
+        sigma: (..., H) standard deviations.
+        steps: what `unforeseen` gives, where it is known.
+    """
     rows = column.shape[-1]
-    column, sigma = column.reshape(-1, rows), sigma.reshape(-1, rows)
+    variance = np.square(sigma.reshape(-1, rows))
+    limit = np.maximum(_BREAK_PX**2, _BREAK_SIGMA**2 * (variance[:, 1:] + variance[:, :-1]))
+    edge = np.ones(variance.shape, bool)
+    edge[:, 1:] = ~((unforeseen(column) if steps is None else steps) <= limit)
+    begins = np.append(edge.ravel().nonzero()[0], edge.size)
+    length = np.diff(begins)
+    return begins[:-1].repeat(length), begins[1:].repeat(length)
+
+
+def unforeseen(column: Array) -> Array:
+    """Squares (P, H - 1) [px^2] of how far columns (..., H) step beyond the slope of their line, infinite far away."""
+    column = column.reshape(-1, column.shape[-1])
     step = column[:, 1:] - column[:, :-1]
     size = np.abs(step)
     # The slope on either side of a step; the smaller disagreement counts, so that a bend is no break.
@@ -141,14 +168,10 @@ def segments(column: Array, sigma: Array) -> tuple[Index, Index]:
     off = np.full(step.shape, np.nan)
     off[:, 2:] = bend
     np.fmin(off[:, :-2], bend, out=off[:, :-2])
-    off = np.where(np.isnan(off), size, off)
-    variance = sigma * sigma
-    limit = np.maximum(_BREAK_PX, _BREAK_SIGMA * np.sqrt(variance[:, 1:] + variance[:, :-1]))
-    edge = np.ones(column.shape, bool)
-    edge[:, 1:] = ~(off <= limit) | (size > 8.0)
-    number = np.cumsum(edge)
-    begins = np.append(edge.ravel().nonzero()[0], edge.size)
-    return begins[number - 1], begins[number]
+    np.copyto(off, size, where=np.isnan(off))
+    np.copyto(off, np.inf, where=size > _FAR_PX)
+    off *= off
+    return off
 
 
 def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) -> tuple[Array, Array, Array]:

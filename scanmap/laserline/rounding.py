@@ -28,8 +28,9 @@ _TO_COLOUR = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0
 _REACH = 3.2  # [widths] samples farther from the line say nothing of it
 _PHASES = 4  # places a column at which a line is tried
 _STEPS = 4  # widths and heights an octave that the error is tabulated at
-_WIDTHS = 2.0 ** (np.arange(-4, 13) / _STEPS)  # [px] 0.5 to 8
-_HEIGHTS = 2.0 ** (np.arange(8, 33) / _STEPS)  # [grey levels] 4 to 256
+_FIRST = (-4, 8)  # steps from 1 to the first of them
+_WIDTHS = 2.0 ** (np.arange(_FIRST[0], 13) / _STEPS)  # [px] 0.5 to 8
+_HEIGHTS = 2.0 ** (np.arange(_FIRST[1], 33) / _STEPS)  # [grey levels] 4 to 256
 
 
 # Of the laser's channel in a mixture, that are weighed up; the last is best where nothing but independent noise counts.
@@ -137,15 +138,15 @@ def shared_px(
         of what is rounded, which is another error a tenth of a column farther on, and of what is rounded to nothing.
     """
     table = _table(rounding, mixture, round(noise, 1))
-    at = [
-        np.clip(np.rint(_STEPS * np.log2(np.fmax(v, 0.1) / first)), 0, n - 1).astype(np.intp)
-        for v, first, n in ((width, _WIDTHS[0], len(_WIDTHS)), (height, _HEIGHTS[0], len(_HEIGHTS)))
-    ]
-    shared: F32 = table.reshape(2, -1).take(at[0] * len(_HEIGHTS) + at[1], axis=1)
+    across, down = (
+        np.minimum(np.maximum(np.rint(_STEPS * np.log2(np.fmax(v, 0.1, dtype=np.float32)) - first), 0), n - 1)
+        for v, first, n in ((width, _FIRST[0], len(_WIDTHS)), (height, _FIRST[1], len(_HEIGHTS)))
+    )
+    shared: F32 = table.reshape(2, -1).take((across * len(_HEIGHTS) + down).astype(np.intp), axis=1)
     return shared
 
 
-def hidden_px(rounding: Rounding, shared: NDArray[np.floating], moved: F64) -> F64:
+def hidden_px(rounding: Rounding, shared: F32, moved: NDArray[np.floating]) -> F32:
     """What of `shared_px` (2, H) fourth differences along the line are blind to (H,) [px].
 
     Args:
@@ -156,13 +157,14 @@ def hidden_px(rounding: Rounding, shared: NDArray[np.floating], moved: F64) -> F
     On an upright line they see nothing of it. Of errors correlated by r from one row to the next they lack the share
     1.6 r - 0.8 r^4 + ...; of a wave, all but (2 sin(phase / 2))^8 / 70.
     """
+    moved = moved.astype(np.float32)
     r = np.exp(np.square(moved) * (-0.5 / _ALIKE_PX**2))
     r4 = np.square(np.square(r))
     r8 = np.square(r4)
     quick = 1.6 * r - 0.8 * r4 + r8 * (8.0 / 35.0 * r - r8 / 35.0)
     phase = np.minimum(np.abs(moved) * (_WAVE / rounding.columns), np.pi)
     seen = np.square(np.square(np.square(2.0 * np.sin(0.5 * phase)))) * (1.0 / 70.0)
-    hidden: F64 = np.sqrt(np.square(shared[0]) * quick + np.square(shared[1]) * np.maximum(1.0 - seen, 0.0))
+    hidden: F32 = np.sqrt(np.square(shared[0]) * quick + np.square(shared[1]) * np.maximum(1.0 - seen, 0.0))
     return hidden
 
 
