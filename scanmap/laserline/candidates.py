@@ -48,16 +48,22 @@ def noises_of(planes: U8) -> F64:
     rows = np.ascontiguousarray(rows)
     flat = rows.reshape(-1, width)
     step = cv2.absdiff(flat[:, 1:], flat[:, :-1]).reshape(pictures, -1)
-    return np.array([_noise_from(own) for own in step])
+    noises, median = np.empty(pictures), 3.0
+    for k, own in enumerate(step):
+        median = _median_of(own, int(median + 0.5))
+        noises[k] = min(max(median / 0.954, 0.3), 60.0)  # half of all differences of Gaussian noise lie below that
+    return noises
 
 
-def _noise_from(step: NDArray[Any]) -> float:
-    # Half of all differences of Gaussian noise lie below 0.954 sigma; counting is finer than the median of integers.
-    count = cv2.calcHist([step], [0], None, [64], [0.0, 64.0]).ravel().cumsum() / max(step.size, 1)
-    k = min(int(count.searchsorted(0.5)), 63)
-    below = float(count[k - 1]) if k else 0.0
-    median = k - 0.5 + (0.5 - below) / max(float(count[k]) - below, 1e-9)
-    return min(max(median / 0.954, 0.3), 60.0)
+def _median_of(step: NDArray[Any], near: int) -> float:
+    """The median of whole numbers up to 63, finer than they are, looked for from `near` on."""
+    half, k = 0.5 * max(step.size, 1), near
+    below, count = int(np.count_nonzero(step < k)), int(np.count_nonzero(step <= k))
+    while below >= half:
+        k, below, count = k - 1, int(np.count_nonzero(step < k - 1)), below
+    while count < half and k < 63:
+        k, below, count = k + 1, count, int(np.count_nonzero(step <= k + 1))
+    return k - 0.5 + (half - below) / max(count - below, 1e-9 * half)
 
 
 def find_candidates(

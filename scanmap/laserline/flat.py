@@ -39,26 +39,26 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mas
     """
     flat = np.zeros(len(column), bool)
     with np.errstate(invalid="ignore"):
-        row = np.flatnonzero((width > _WIDE_PX) & (peak < SATURATED))
-    if len(row) < _LEAST_ROWS:
+        able = ((width > _WIDE_PX) & (peak < SATURATED)).reshape(-1, height)
+    count = np.count_nonzero(able, axis=1)
+    if count.sum() < _LEAST_ROWS:
         return flat
-    run = numbered(row, column[row], 2, height)
     # Of many rows some tell of all, and of most runs a few that they are not.
-    picture = row // height
-    count = np.bincount(picture)
     step = 1 + count // _ENOUGH_ROWS
-    fewer, step = np.where(count < _MANY_ROWS, step, _FEWER * step)[picture], step[picture]
-    place = row % height
-    few = row[place % fewer == 0]
+    few = _every(able, np.where(count < _MANY_ROWS, step, _FEWER * step))
     excess, top, _ = _profiles(plane, few, column, width)
-    near = np.zeros((len(flat) // height, height), np.uint8)
-    near.ravel()[few[excess > -_DOUBT * top]] = 1
-    near = np.asarray(cv2.dilate(near, np.ones((1, 4 * _NEARBY + 1), np.uint8)))
-    asked = (place % step == 0) & (near.ravel()[row] > 0)
-    if not asked.any():
+    doubted = few[excess > -_DOUBT * top]
+    if not doubted.size:
         return flat
-    every, by_run = row, run
-    row, run, step = row[asked], run[asked], step[asked]
+    near = np.zeros(able.shape, np.uint8)
+    near.ravel()[doubted] = 1
+    near = np.asarray(cv2.dilate(near, np.ones((1, 4 * _NEARBY + 1), np.uint8)))
+    row = _every(able & (near > 0), step)
+    if not row.size:
+        return flat
+    every = able.ravel().nonzero()[0]
+    by_run = numbered(every, column[every], 2, height)
+    run, step = by_run[np.searchsorted(every, row)], step[row // height]
     excess, top, clipped = _profiles(plane, row, column, width)
     total = np.zeros((5, len(row) + 1))
     np.cumsum([excess, excess * excess, top, peak[row], clipped], axis=1, out=total[:, 1:])
@@ -74,6 +74,14 @@ def flat_tops(column: F64, width: F64, peak: F64, plane: U8, height: int) -> Mas
     for ask in (np.maximum(after - 1, 0), np.minimum(after, len(row) - 1)):
         flat[every] |= sure[ask] & (run[ask] == by_run)
     return flat
+
+
+def _every(able: Mask, step: Index) -> Index:
+    """Every `step`-th (P,) row of pictures (P, H) below each other, as far as it is `able`."""
+    some = np.zeros_like(able)
+    for own, rows, k in zip(some, able, step.tolist(), strict=True):
+        own[::k] = rows[::k]
+    return some.ravel().nonzero()[0]
 
 
 def _profiles(plane: U8, row: Index, column: F64, width: F64) -> tuple[F64, F64, Mask]:

@@ -157,8 +157,12 @@ def crumbs(column: Array, weak: Mask, rows: int, least: int = 12, fewest: int = 
     found = np.isfinite(column).nonzero()[0]
     if not found.size:
         return mask
-    number = numbered(found, column[found], GAP_ROWS + 1, rows)
-    length = np.bincount(number)
-    doubtful = np.bincount(number, weak[found]) > 0.5 * length
-    mask[found[((length < fewest) | (doubtful & (length < least)))[number]]] = True
+    broken = _breaks(found, column[found], GAP_ROWS + 1, rows)
+    edges = np.concatenate([[0], broken.nonzero()[0] + 1, [len(found)]])
+    length = edges[1:] - edges[:-1]
+    lost = length < least
+    if lost.any():
+        doubtful = np.add.reduceat(weak[found], edges[:-1], dtype=np.intp) > 0.5 * length
+        lost &= doubtful | (length < fewest)
+        mask[found[lost.repeat(length)]] = True
     return mask
