@@ -143,11 +143,18 @@ def _halved(values: U8 | U16) -> U16:
 
 
 def _stands_out(values: U16) -> U16:
-    """Sum over the line's width minus the brighter of its two sides, at least 0, from column _EDGE on."""
-    # OpenCV is twice as quick as NumPy where what it adds is not aligned.
-    summed = cv2.add(cv2.add(values[:, :-2], values[:, 1:-1]), values[:, 2:])
+    """Sum over the line's width minus the brighter of its two sides, at least 0, from column _EDGE on.
+
+    As many columns (B, W) as there are values, the last ones 0: one row after the other is summed as if they were one.
+    """
+    row = values.reshape(1, -1)
+    summed = row[:, :-2] + row[:, 1:-1]
+    summed += row[:, 2:]
     side = cv2.max(summed[:, : -2 * _AWAY], summed[:, 2 * _AWAY :])
-    return np.asarray(cv2.subtract(summed[:, _AWAY:-_AWAY], side), np.uint16)
+    response = np.empty_like(values)
+    cv2.subtract(summed[:, _AWAY:-_AWAY], side, response.reshape(1, -1)[:, : -2 * _EDGE])
+    response[:, -2 * _EDGE :] = 0
+    return response
 
 
 def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
