@@ -118,7 +118,7 @@ def stand_out(plane: U8, row: Index, column: F32, noise: F64) -> tuple[Index, F3
     """
     reach, far, core = 5, 9, 5
     known = ~np.isnan(column)
-    middle = np.rint(np.where(known, column, np.float32(0.0))).astype(np.intp)
+    middle = np.rint(np.where(known, column, np.float32(plane.shape[1] // 2))).astype(np.intp)
     y = strips(plane, row, middle, reach + far + core // 2).astype(np.int16)
     # Sums of five columns, one array row per column: every step below runs along the rows of the image.
     smooth = y[:-4] + y[1:-3]
