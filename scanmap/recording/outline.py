@@ -49,7 +49,8 @@ class Outline:
         if channel_id not in self.directory.channels or not len(times_ns):
             return
         self.counts[channel_id] = self.counts.get(channel_id, 0) + len(times_ns)
-        first, last = int(times_ns.min()), int(times_ns.max())
+        times = times_ns.tolist()  # one or two of them, mostly
+        first, last = min(times), max(times)
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
         self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
 
