@@ -47,21 +47,23 @@ def find_leads(rows: U8, limits: tuple[F64, F64]) -> Leads:
         limits: first and last column (N,) that a block's line can have, NaN where it can have none.
     """
     # One picture after the other: all of them together would not fit into the processor's cache.
-    each = zip(*(_leads_of_one(own, limits) for own in rows), strict=True)
+    # As bytes, by which is known what has been told of them before.
+    first, last = (limit.tobytes() for limit in limits)
+    each = zip(*(_leads_of_one(own, first, last) for own in rows), strict=True)
     return Leads(*(np.concatenate(values).reshape(len(rows), -1) for values in each))
 
 
-def _leads_of_one(rows: U8, limits: tuple[F64, F64]) -> Leads:
+def _leads_of_one(rows: U8, first: bytes, last: bytes) -> Leads:
     sums, scale = _halved(rows), 2
     index = np.arange(len(rows))
-    response = _allowed(_stands_out(sums), scale, limits)
+    response = _allowed(_stands_out(sums), scale, first, last)
     at = response.argmax(axis=1)
     column = (scale * (at + _EDGE) + 0.5 * (scale - 1)).astype(np.float32)
     height = response[index, at] * np.float32(1.0 / (_CENTRE * scale))
     rival, beside = _highest_elsewhere(response, at, scale)
     sums, scale = _halved(sums), 2 * scale
     if sums.shape[1] > 2 * _EDGE + 2:
-        response = _allowed(_stands_out(sums), scale, limits)
+        response = _allowed(_stands_out(sums), scale, first, last)
         other, place = _highest_elsewhere(response, (at + _EDGE) // 2 - _EDGE, scale)
         beside = np.where(other > rival, place, beside)
         np.maximum(rival, other, out=rival)
@@ -157,14 +159,11 @@ def _stands_out(values: U16) -> U16:
     return response
 
 
-def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
+def _allowed(response: U16, scale: int, first: bytes, last: bytes) -> U16:
     """The response, 0 outside the limits, in place."""
-    width, some = response.shape[1], ~np.isnan(limits[0])
-    if not some.all():
-        response[~some] = 0
-        if not some.any():
-            return response
-    left, right, uneven = _beyond(limits[0].tobytes(), limits[1].tobytes(), scale, width)
+    left, right, uneven, none = _beyond(first, last, scale, response.shape[1])
+    if none.size:
+        response[none] = 0
     response[:, :left] = 0
     response[:, right + 1 :] = 0
     for start, inside in uneven:
@@ -173,12 +172,17 @@ def _allowed(response: U16, scale: int, limits: tuple[F64, F64]) -> U16:
 
 
 @lru_cache(maxsize=8)
-def _beyond(first: bytes, last: bytes, scale: int, width: int) -> tuple[int, int, list[tuple[int, U16]]]:
+def _beyond(
+    first: bytes, last: bytes, scale: int, width: int
+) -> tuple[int, int, list[tuple[int, U16]], NDArray[np.intp]]:
     """First and last column (of `width`) of a response in the limits (N,), the same for every picture of a scan.
 
-    And where rows differ: a first column, and (N, n) 1 for what is within.
+    And where rows differ: a first column, and (N, n) 1 for what is within; and rows without limits.
     """
     low, high = np.frombuffer(first), np.frombuffer(last)
+    none = np.isnan(low).nonzero()[0]
+    if len(none) == len(low):
+        return width, width, [], none
     # In columns of the response, which lacks the picture's edge; only between the extremes do rows differ.
     ends = np.array([np.nanmin(low), np.nanmax(low), np.nanmin(high), np.nanmax(high)]) / scale - _EDGE
     left, inner_left, inner_right, right = np.minimum(np.maximum(np.rint(ends), 0), width).astype(np.intp).tolist()
@@ -188,4 +192,4 @@ def _beyond(first: bytes, last: bytes, scale: int, width: int) -> tuple[int, int
             x = np.arange(start + _EDGE, min(stop, width) + _EDGE, dtype=np.float32) * scale + 0.5 * (scale - 1)
             inside = (x >= low[:, None] - scale) & (x <= high[:, None] + scale)
             uneven.append((start, inside.astype(np.uint16)))
-    return left, right, uneven
+    return left, right, uneven, none

@@ -266,11 +266,12 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
             lost = (reason != Reason.OK) & ~final
             take_cores(line, (r[lost], c[lost]), y[:, lost].T, params.max_width_px, rows.of(lost), params)
             good = reason == Reason.OK
+        total_sigma = np.sqrt(np.square(peaks.sigma_px) + np.square(peaks.bias_px))
         k = good.nonzero()[0]
         at_good = r[k]
         line.column_px[at_good], line.peak[at_good] = c[k] + offset[k], peaks.height[k]
         line.width_px[at_good] = peaks.width_px[k]
-        line.sigma_px[at_good] = np.maximum(np.hypot(peaks.sigma_px[k], peaks.bias_px[k]), _SIGMA_LEAST_PX)
+        line.sigma_px[at_good] = np.maximum(total_sigma[k], _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
         doubts.edges.shift[at_good], doubts.edges.doubt[at_good] = own.shift[k], own.doubt[k]
         doubts.plain[at_good] = (peaks.bias_px[k] == 0.0) & ~peaks.clipped[k]

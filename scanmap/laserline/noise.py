@@ -47,7 +47,7 @@ def noise_variance(residual: F32, weight: F32, fitted: F32 | float, parts: Seque
         if rows := len(own[part]):
             last = first - (-rows // _ROWS_POOLED)
             # The median of chi^2 / k lies below its mean by (1 - 2 / 9k)^3 (Wilson and Hilferty).
-            k = float(freedom[part].mean())
+            k = float(np.add.reduce(freedom[part])) / rows
             scaled = middle[first:last] * np.float32(0.5 / (1.0 - 2.0 / (9.0 * k)) ** 3)
             common[part], first = scaled.repeat(_ROWS_POOLED)[:rows], last
     limit = np.float32(1.0) + np.sqrt(np.float32(32.0) / freedom)
@@ -80,7 +80,7 @@ def speckle_contrasts(residual: F32, bell: F32, height: F32, weight: F32, rows: 
         told = _speckle_contrasts(
             residual, bell, height, weight, [rows.parts[k] for k in asked], rows.noise_of[asked], most
         )
-        contrast[asked] = np.nan_to_num(told)
+        contrast[asked] = [max(0.0, one) for one in told]
         asked = [k for k, one in zip(asked, told, strict=True) if one != 0.0]
         if not asked:
             break

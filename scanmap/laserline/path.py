@@ -131,7 +131,7 @@ def stand_out(plane: U8, row: Index, column: F32, noise: F64) -> tuple[Index, F3
     away = np.square(np.arange(-reach, reach + 1))[:, None] * (2 * core * _PATH_WORTH * noise)
     away = np.minimum(away, 1000.0).astype(np.int16)
     rank = 2 * inner - side
-    rank -= away if len(noise) == 1 else away.take(row // (len(plane) // len(noise)), axis=1)
+    rank -= away if len(noise) == 1 else away.take(row // (len(plane) // len(noise)), axis=1, mode="clip")
     # The place is packed below the rank, so that one maximum gives both: ten times the speed of argmax. From -2275 to
     # 2550 there is room for eleven places in 16 bits.
     packed = rank.view(np.uint16)
@@ -139,8 +139,8 @@ def stand_out(plane: U8, row: Index, column: F32, noise: F64) -> tuple[Index, F3
     packed *= np.uint16(2 * reach + 1)
     packed += np.arange(2 * reach, -1, -1, dtype=np.uint16)[:, None]
     at = 2 * reach - (packed.max(axis=0) % np.uint16(2 * reach + 1)).astype(np.intp)
-    index = np.arange(len(row))
-    response = np.maximum((inner[at, index] - side[at, index]) * np.float32(1.0 / core), np.float32(1e-3))
+    lead = (inner - side).ravel().take(at * len(row) + np.arange(len(row)))
+    response = np.maximum(lead * np.float32(1.0 / core), np.float32(1e-3))
     return middle - reach + at, np.where(known, response, np.float32(0.0))
 
 

@@ -208,14 +208,17 @@ def _quadratic(column: Array, sigma: Array, at: Index, first: Index, rows: int) 
     chi2 = (q0 - c0 * r0 - c1 * r1 - significance * (kept * (2.0 - kept))) / max(rows - 3, 1)
     bend *= kept
     # Each row by the polynomial of its own window, which is centred on it except at a segment's ends.
-    tau = (at - first - rows // 2) * (2.0 / rows)
     own = np.arange(len(at)) if few else first
-    c0, c1, b0, b1, bend = c0[own], c1[own], b0[own], b1[own], bend[own]
-    off = tau * tau - b0 - b1 * tau
-    value = base[at // height] + c0 + c1 * tau + bend * off
-    line = (m2[own] - 2.0 * tau * m1[own] + tau * tau * m0[own]) * per_det[own]
-    variance = line + off * off / power[own] * _risk(significance[own], at, column.shape)
-    return value, np.sqrt(variance), chi2[own]
+    value, line, bent = ((c0 - bend * b0)[own], (m2 * per_det)[own], (b0 * b0 / power)[own])
+    aside = at - first - rows // 2
+    ends = aside.nonzero()[0]
+    i, tau = own[ends], aside[ends] * (2.0 / rows)
+    off = tau * tau - b0[i] - b1[i] * tau
+    value[ends] = c0[i] + c1[i] * tau + bend[i] * off
+    line[ends] = (m2[i] - 2.0 * tau * m1[i] + tau * tau * m0[i]) * per_det[i]
+    bent[ends] = off * off / power[i]
+    variance = line + bent * _risk(significance[own], at, column.shape)
+    return base[at // height] + value, np.sqrt(variance), chi2[own]
 
 
 def _risk(significance: Array, at: Index, shape: tuple[int, ...]) -> Array:
