@@ -89,10 +89,11 @@ def unexplained_by_height(column: Array, sigma: Array, start: Index, lags: tuple
         if not of_all > 0.0 or lowest[k] == highest[k]:
             continue
         for one in range(int(lowest[k]), int(highest[k]) + 1):
-            some = [ratio[octave[k, at] == one] for at, ratio in told]
+            high = octave[k] == one
+            some = [ratio[high[at]] for at, ratio in told]
             own, count = _typical(some), min(map(len, some))
             if own >= 0.0:
-                factor[k, octave[k] == one] = of_all * (own / of_all) ** (count / (count + TELLING))
+                np.copyto(factor[k], of_all * (own / of_all) ** (count / (count + TELLING)), where=high)
     return factor
 
 

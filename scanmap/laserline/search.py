@@ -73,7 +73,7 @@ def search(sight: Sight, window: F64, min_snr: float, still: Mask | None = None)
             found = _with_blocks(found, rest, _all_candidates(picture, rest, window, min_snr))
             found, score = _scored(picture, found, quick.shares[k], window, min_snr)
         column[k] = choose_path(found, score, min_snr)
-        places.append(np.hstack([_places(found, min_snr), quick.beside[k, :, None]]))
+        places.append(np.concatenate((_places(found, min_snr), quick.beside[k, :, None]), axis=1))
     return Course(column, good, places)
 
 
