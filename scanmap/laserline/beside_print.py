@@ -23,7 +23,6 @@ Mask = NDArray[np.bool_]
 _HALF = 13  # of the window [px]
 _MISFIT, _NOISE = 3.0, 1.5  # noises that a profile is no beam's from, and what noise is at least [grey levels]
 _FEW, _SOME = 0.01, 0.03  # shares of a picture's rows that are let be: odd ones, and those that print could explain
-_PART = 4  # one in so many rows tells whether more of them are worth asking
 _TELLING, _WIDER = 40, 1.3  # lines that tell the usual width, and how much wider one may be
 _CORE = 2.0  # such widths beside the middle that say nothing of the room
 _SHOWN = 4.0  # noises that the other channel must explain beside the line
@@ -65,15 +64,16 @@ def apart_from_print(
         if len(own) >= _TELLING:
             own = np.sort(own[:: 1 + len(own) // _TELLING])
             usual[k] = own[len(own) // 2]
-    odd &= (worth & (usual > 0))[rows.picture]
-    # In most pictures the other channel shows nothing that could explain them, as some of the rows tell.
-    part = not_one(np.flatnonzero(odd & (at[0] % sight.height % _PART == 0)))
-    tells = _shown(sight, (at[0][part], at[1][part]), usual, rows.of(part))[-1] if part.size else np.zeros(0, bool)
-    worth = _worth(tells, rows.of(part), 0.5 / _PART * _SOME * sight.height)
-    some = not_one(np.flatnonzero(odd & worth[rows.picture]))
+    some = not_one(np.flatnonzero(odd & (worth & (usual > 0))[rows.picture]))
     if not some.size:
         return
-    own, other, usable, slope, tells = _shown(sight, (at[0][some], at[1][some]), usual, rows.of(some))
+    across = strips(sight.image, at[0][some], at[1][some], _HALF)
+    own, other = across[:, sight.channel].astype(np.float32), across[:, NEIGHBOUR[sight.channel]].astype(np.float32)
+    usable = (np.maximum(own, other) < SATURATED).astype(np.float32)
+    beside = np.abs(np.arange(-_HALF, _HALF + 1))[:, None] > _CORE * _WIDER * usual[rows.picture[some]]
+    slope, shown = _slope(other, own, usable * beside)
+    # Of most rows the other channel shows nothing that could explain them.
+    tells = slope * shown > np.float32(_SHOWN) * rows.noise[some]
     tell = not_one(np.flatnonzero(tells & _worth(tells, rows.of(some), _SOME * sight.height)[rows.picture[some]]))
     if not tell.size:
         return
@@ -90,20 +90,6 @@ def apart_from_print(
     for values, again in zip(peaks[:-1], found[:-1], strict=True):
         values[lines] = again[better]
     reason[lines] = Reason.OK
-
-
-def _shown(sight: Sight, at: tuple[Index, Index], usual: F32, rows: Rows) -> tuple[F32, F32, F32, F32, Mask]:
-    """Samples (n, N) around places: of the laser's channel, of another, and 1 where both say more than "bright".
-
-    And by how much more the first varies beside a line (N,), and whether the other explains more than noise (N,).
-    """
-    assert sight.image is not None
-    across = strips(sight.image, *at, _HALF)
-    own, other = across[:, sight.channel].astype(np.float32), across[:, NEIGHBOUR[sight.channel]].astype(np.float32)
-    usable = (np.maximum(own, other) < SATURATED).astype(np.float32)
-    beside = np.abs(np.arange(-_HALF, _HALF + 1))[:, None] > _CORE * _WIDER * usual[rows.picture]
-    slope, shown = _slope(other, own, usable * beside)
-    return own, other, usable, slope, slope * shown > np.float32(_SHOWN) * rows.noise
 
 
 def _worth(odd: Mask, rows: Rows, most: float) -> Mask:
