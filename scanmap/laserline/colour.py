@@ -13,7 +13,7 @@ from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
 from scanmap.laserline.result import LaserLine
 from scanmap.laserline.runs import numbered
-from scanmap.laserline.shares import HALF, across, flank_lead, light_added
+from scanmap.laserline.shares import HALF, across, beyond_pattern, flank_lead, light_added
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -41,6 +41,8 @@ _CLIPPED, _COLOURED, _SURELY = 0.3, 10.0, 0.95
 _BRIGHT = 170.0  # [grey levels] beside a core
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
+# Of a factor, from which down a candidate is asked again as one on stripes; of its light beyond them, that others have.
+_IN_DOUBT, _BEYOND = 0.5, 0.3
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
 
@@ -115,6 +117,11 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     part = np.minimum(near_by.own[broad] / response[broad], 1.0)
     wide = np.where(coarse.own > near_by.own[broad], _of_laser(coarse, laser, noise), 0.0)
     factor[broad] = np.maximum(part * factor[broad], wide)
+    asked = np.flatnonzero(factor < _IN_DOUBT)
+    if asked.size:
+        light = beyond_pattern(_profiles(image, block[asked], column[asked], 1)[0], channel)
+        other = np.maximum(light[channel - 1], light[channel - 2])
+        factor[asked[(light[channel] > _BROAD * response[asked]) & (other < _BEYOND * light[channel])]] = 1.0
     doubt[block, which] = factor
     return doubt
 
@@ -187,6 +194,16 @@ def strangers(line: LaserLine, image: U8, channel: int, pure: Mask, rows: int) -
     coloured, bright = _core_of(y, channel, run)
     lost[row] = _white_beside(image, row, middle, channel, clipped, run) & ~(coloured & bright)[run]
     stranger = _in_other_channels(by_run, count, channel)[run]
+    if stranger.any():
+        asked = np.flatnonzero(stranger)
+        again = beyond_pattern(y[..., asked].astype(np.float32), channel)
+        share, told_share = (
+            np.maximum(h[channel - 1], h[channel - 2]) / np.maximum(h[channel], 1.0) for h in (height[:, asked], again)
+        )
+        told = (again[channel] > 0) & (told_share < share)
+        height[:, asked[told]] = again[:, told]
+        by_run[:3] = [np.bincount(run, value) for value in height]
+        stranger = _in_other_channels(by_run, count, channel)[run]
     if stranger.any():
         # Sums over the rows nearby as differences of sums from the start.
         total = np.zeros((len(values), len(row) + 1))
