@@ -25,11 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import Reason
+from scanmap.scan.floor_images import floor_images
 from scanmap.scan.openings import BEHIND_M, Opening, openings, walls
 from scanmap.scan.panorama import Panorama
 from scanmap.scan.range_image import Scan, ScanParams
 from scanmap.scan.second_lines import Pictures, shown
-from scanmap.scan.streaks import streaks
+from scanmap.scan.streaks import level_of, streaks
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -55,7 +56,7 @@ class Mirror(NamedTuple):
 
     plane: F64  # (4,) n.x + d = 0 in the world frame [m], n toward the scanner
     cells: Mask  # (B, H) of the scan: points that are images
-    agree: int  # patches of upright surfaces on which an image lies, or second lines in pictures
+    agree: int  # patches of upright surfaces on which an image lies, or second lines in pictures, or cells in a floor
     deny: int  # patches or cells in which an image hangs in the air
 
 
@@ -72,14 +73,15 @@ def without_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pict
 
 
 def find_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pictures | None = None) -> list[Mirror]:
-    """Upright mirrors on the walls of a scan whose bearings ascend, and the cells that show images in them."""
+    """Upright mirrors on the walls of a scan whose bearings ascend, and its floor; with the cells that show images."""
     every, each = max(1, len(scan) // _COLUMNS), max(1, scan.rows // _ROWS)
     thin = _thinned(scan, every, each)
     if min(len(thin), thin.rows) < 3 or not thin.valid.any() or np.hypot(*scan.mount.offset_m[:2]) > _OFF_AXIS_M:
         return []
     seen = Panorama(thin, params or ScanParams())
     found: list[Mirror] = []
-    for wall in walls(seen.points[seen.valid], np.nan_to_num(seen.normals[seen.valid])):
+    planes = walls(seen.points[seen.valid], np.nan_to_num(seen.normals[seen.valid]))
+    for wall in planes:
         for opening in openings(seen, wall):
             mirror = _likely(seen, opening, wall) if opening.cut else None
             if mirror is None and pictures is not None:
@@ -90,6 +92,11 @@ def find_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Picture
                 if pictures is not None:
                     hole = cv2.dilate(_closed(mirror.cells), _AROUND).astype(bool)
                     found[-1].cells[:] |= streaks(scan, pictures, seen, mirror.plane, hole)
+    floor = level_of(seen, 1.0)
+    if pictures is not None and floor is not None:
+        images = floor_images(scan, pictures, seen, floor, planes)
+        if images.any():
+            found.append(Mirror(np.array([0.0, 0.0, 1.0, -floor]), images, int(images.sum()), 0))
     return found
 
 

@@ -129,6 +129,9 @@ def shown(scan: Scan, pictures: Pictures, seen: Panorama, wall: F64, hole: Mask)
         wall: (4,) its plane, n toward the scanner.
         hole: (b, h) the opening, of the thinned scan.
     """
+    best = Shown(wall, 0, 0, 0)
+    if not (hole & seen.valid).any():  # all of it was seen in another mirror
+        return best
     views, columns = _views(scan, pictures)
     lit = (
         _by_camera(scan, pictures, (views, columns), wall, hole),
@@ -138,7 +141,6 @@ def shown(scan: Scan, pictures: Pictures, seen: Panorama, wall: F64, hole: Mask)
     own[views] = scan.column_px[columns]
     way = np.nan_to_num(seen.points[hole & seen.valid]).mean(axis=0)
     foot = way * (-wall[3] / (way @ wall[:3]))
-    best = Shown(wall, 0, 0, 0)
     if sum(_met(pictures, own, *kind.lines(wall), _FAR_PX)[0] for kind in lit) < _LEAST:
         return best
     for turn in _TURNS:

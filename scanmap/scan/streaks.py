@@ -45,11 +45,13 @@ def streaks(scan: Scan, pictures: Pictures, seen: Panorama, mirror: F64, hole: M
     source = -pictures.laser_plane[3] * sheet
     normal = turned(np.broadcast_to(mirror[:3], (len(turn), 3)), -turn)
     way = turned(scan.points[column, row].astype(np.float64), -turn) - eye
-    among, levels = seen.valid & ~hole, _levels(seen)
+    among = seen.valid & ~hole
+    # Both go on where they are too steep to be in view; an upright mirror shows them at their own height.
+    levels = [level for level in (level_of(seen, 1.0), level_of(seen, -1.0)) if level is not None]
     with np.errstate(divide="ignore", invalid="ignore"):
         for place, cross in (
             _laser_turned(eye, way, sheet, source, normal, mirror[3]),
-            _camera_turned(eye, way, sheet, source, normal, mirror[3]),
+            camera_turned(eye, way, sheet, source, normal, mirror[3]),
         ):
             height = np.einsum("ij,ij->i", place, normal) + mirror[3]
             k = np.flatnonzero((height > _BEFORE_M) & (np.linalg.norm(place - way - eye, axis=1) > _APART_M))
@@ -62,21 +64,16 @@ def streaks(scan: Scan, pictures: Pictures, seen: Panorama, mirror: F64, hole: M
     return _whole_runs(scan, found)
 
 
-def _levels(seen: Panorama) -> list[float]:
-    """Heights [m] of floor and ceiling, which go on where they are too steep to be in view.
-
-    An upright mirror shows them at their own height.
-    """
-    levels = list[float]()
-    for facing in (1.0, -1.0):
-        z = seen.points[facing * np.nan_to_num(seen.normals[..., 2]) > _LEVEL, 2]
-        if len(z) >= _LEAST_CELLS:
-            count, edge = np.histogram(z, np.arange(z.min() - _FLAT_M, z.max() + 2.0 * _FLAT_M, _FLAT_M))
-            # Tables and shelves lie between.
-            many = edge[np.flatnonzero(count >= _LEVEL_SHARE * len(z))] + 0.5 * _FLAT_M
-            middle = (many if len(many) else edge)[0 if facing > 0 else -1]
-            levels.append(float(np.median(z[np.abs(z - middle) < _FLAT_M])))
-    return levels
+def level_of(seen: Panorama, facing: float) -> float | None:
+    """Height [m] of the floor (`facing` 1) or the ceiling (-1); None where too little faces so."""
+    z = seen.points[facing * np.nan_to_num(seen.normals[..., 2]) > _LEVEL, 2]
+    if len(z) < _LEAST_CELLS:
+        return None
+    count, edge = np.histogram(z, np.arange(z.min() - _FLAT_M, z.max() + 2.0 * _FLAT_M, _FLAT_M))
+    # Tables and shelves lie between.
+    many = edge[np.flatnonzero(count >= _LEVEL_SHARE * len(z))] + 0.5 * _FLAT_M
+    middle = (many if len(many) else edge)[0 if facing > 0 else -1]
+    return float(np.median(z[np.abs(z - middle) < _FLAT_M]))
 
 
 def _whole_runs(scan: Scan, some: Mask) -> Mask:
@@ -103,7 +100,7 @@ def _laser_turned(eye: F64, way: F64, sheet: F64, source: F64, normal: F64, d: f
     return place, laser + np.where((part > 0) & (part < 1), part, np.nan)[:, None] * light
 
 
-def _camera_turned(eye: F64, way: F64, sheet: F64, source: F64, normal: F64, d: float) -> tuple[F64, F64]:
+def camera_turned(eye: F64, way: F64, sheet: F64, source: F64, normal: F64, d: float) -> tuple[F64, F64]:
     """Where (N, 3) camera rays after the mirror meet the laser's plane, and where they meet the mirror."""
     before = -(normal @ eye + d) / np.einsum("ij,ij->i", normal, way)
     cross = eye + np.where(before > 0, before, np.nan)[:, None] * way
