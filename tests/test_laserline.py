@@ -269,6 +269,7 @@ BEYOND = {
     ("tube of light", False, False),
     # On stripes about as wide as the line, in one grey picture.
     ("curtain", False, False),
+    ("upright curtain", False, False),
 }
 ROOMS = [
     (name, colour, off)

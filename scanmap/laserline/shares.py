@@ -30,6 +30,12 @@ def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.in
     return core * np.float32(0.2) - side * np.float32(0.25), y[HALF]
 
 
+def others_share(light: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
+    """What light (3, N) has in the other channels where it is highest, over what it has in the laser's (N,)."""
+    share: NDArray[np.floating] = np.maximum(light[channel - 1], light[channel - 2]) / np.maximum(light[channel], 1.0)
+    return share
+
+
 def light_added(y: F32, channel: int) -> F32:
     """Light (3, N) by channel that N narrow places of profiles y (2 HALF + 1, 3, N) add, a mean of five columns.
 
@@ -48,11 +54,8 @@ def light_added(y: F32, channel: int) -> F32:
         beside = y[[HALF - 5, HALF - 4, HALF + 4, HALF + 5], channel].sum(axis=0)
         own = 0.2 * (near - 1.75 * beside)
         again = smeared - smeared[channel] + own
-        share = [
-            np.maximum(h[channel - 1], h[channel - 2]) / np.maximum(h[channel], 1.0) for h in (again, added[:, at])
-        ]
-        better = at[share[0] < share[1]]
-        added[:, better] = again[:, share[0] < share[1]]
+        purer = others_share(again, channel) < others_share(added[:, at], channel)
+        added[:, at[purer]] = again[:, purer]
     return added
 
 
@@ -82,6 +85,13 @@ def beyond_pattern(y: F32, channel: int) -> F32:
     told &= y.max(axis=(0, 1)) < COLOURLESS
     added[channel] = light
     return np.where(told, added, np.float32(0.0))
+
+
+def purest_light(y: F32, light: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
+    """The light (3, N) of places of profiles y (2 HALF + 1, 3, N), or what is beyond a pattern where that is purer."""
+    beyond = beyond_pattern(y, channel)
+    purer = (beyond[channel] > 0) & (others_share(beyond, channel) < others_share(light, channel))
+    return np.where(purer, beyond, light)
 
 
 def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = False) -> tuple[F32, F32]:
