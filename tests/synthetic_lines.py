@@ -260,17 +260,6 @@ def _curtain(room: Room) -> None:
     room.ambient[part] = cv2.GaussianBlur(cloth, (0, 0), 0.8)[part]
 
 
-def _upright_curtain(room: Room) -> None:
-    """Bright stripes of red and white, upright, and the line along a border of two: all its rows look alike."""
-    wide = 7
-    room.column[:], room.peak[:] = 2 * wide * (0.4 * room.width // (2 * wide)), 46.0
-    red = ((np.arange(room.width)[None] // wide) % 2).astype(np.float32)[..., None]
-    cloth = red * np.float32([30.0, 34.0, 130.0]) + (1.0 - red) * np.float32([140.0, 144.0, 150.0])
-    cloth = cv2.GaussianBlur(cloth, (0, 0), 0.8).reshape(cloth.shape)
-    across = slice(int(0.1 * room.width), int(0.9 * room.width))
-    room.ambient[int(0.3 * room.height) : int(0.75 * room.height), across] = cloth[:, across]
-
-
 def _red_ribs(room: Room) -> None:
     """Narrow red ribs on a dark wall: the line's colour and width, half its height."""
     for x in np.linspace(0.1, 0.9, 9) * room.width:
@@ -413,7 +402,6 @@ HARD: dict[str, Callable[[Room], None]] = {
     "small lamps": _lamps_small,
     "stripes": _stripes,
     "curtain": _curtain,
-    "upright curtain": _upright_curtain,
     "red ribs": _red_ribs,
     "red spines": _spines,
     "tube of light": _tube,

@@ -267,9 +267,9 @@ BEYOND = {
     ("white text", False, False),
     # Without colour and without an off frame a tube is a line; which of the two moves only the next bearing tells.
     ("tube of light", False, False),
-    # On stripes about as wide as the line, in one grey picture.
+    # On stripes about as wide as what its colour is measured from, a line's light is not told from theirs.
+    ("curtain", True, False),
     ("curtain", False, False),
-    ("upright curtain", False, False),
 }
 ROOMS = [
     (name, colour, off)

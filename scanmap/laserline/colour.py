@@ -13,7 +13,7 @@ from scanmap.laserline.grey import runs_at
 from scanmap.laserline.path import CONNECTED_PX
 from scanmap.laserline.result import LaserLine
 from scanmap.laserline.runs import numbered
-from scanmap.laserline.shares import HALF, across, beyond_pattern, flank_lead, light_added, others_share, purest_light
+from scanmap.laserline.shares import HALF, across, flank_lead, light_added
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -41,8 +41,6 @@ _CLIPPED, _COLOURED, _SURELY = 0.3, 10.0, 0.95
 _BRIGHT = 170.0  # [grey levels] beside a core
 _NEARBY = 8  # rows of a run on either side of one that are asked with it
 _BROAD, _COARSE = 0.6, 4  # part of a candidate's height that narrow ones show near by; columns a sample of others
-# Of a factor, from which down a candidate is asked again as one on stripes; of its light beyond them, that others have.
-_IN_DOUBT, _BEYOND = 0.5, 0.3
 _TELLING_SNR = 12.0  # of a candidate whose colour is worth asking for
 _CHAIN_SHARE = 0.06  # of all blocks, at least, in the chains that the laser's colour is measured from
 
@@ -117,11 +115,6 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     part = np.minimum(near_by.own[broad] / response[broad], 1.0)
     wide = np.where(coarse.own > near_by.own[broad], _of_laser(coarse, laser, noise), 0.0)
     factor[broad] = np.maximum(part * factor[broad], wide)
-    asked = np.flatnonzero(factor < _IN_DOUBT)
-    if asked.size:
-        light = beyond_pattern(_profiles(image, block[asked], column[asked], 1)[0], channel)
-        other = np.maximum(light[channel - 1], light[channel - 2])
-        factor[asked[(light[channel] > _BROAD * response[asked]) & (other < _BEYOND * light[channel])]] = 1.0
     doubt[block, which] = factor
     return doubt
 
@@ -185,22 +178,28 @@ def strangers(line: LaserLine, image: U8, channel: int, pure: Mask, rows: int) -
     row, run = row[doubtful], run[doubtful]
     middle = np.rint(column[row]).astype(np.intp)
     y = across(image, row, middle)
+    height = light_added(y.astype(np.float32), channel)
     clipped = y[HALF, channel] >= COLOURLESS
+    count = np.bincount(run)
+    whole = line.peak[row] * np.minimum(_CORE_LIGHT * line.width_px[row], 1.0)
+    values = (*height, clipped, whole)
+    by_run = np.array([np.bincount(run, value) for value in values])
     coloured, bright = _core_of(y, channel, run)
     lost[row] = _white_beside(image, row, middle, channel, clipped, run) & ~(coloured & bright)[run]
-    beam = line.peak[row] * np.minimum(_CORE_LIGHT * line.width_px[row], 1.0)
-    values = np.array([*light_added(y.astype(np.float32), channel), clipped, beam, np.ones(len(row))])
-    by_run = _sums(values, run)
-    stranger = _in_other_channels(by_run, channel)[run]
+    stranger = _in_other_channels(by_run, count, channel)[run]
     if stranger.any():
-        values[:3, stranger] = purest_light(y[..., stranger].astype(np.float32), values[:3, stranger], channel)
-        by_run = _sums(values, run)
-        stranger = _in_other_channels(by_run, channel)[run]
-    if stranger.any():
-        lost[row[stranger & _in_other_channels(_sums_nearby(values, run), channel)]] = True
+        # Sums over the rows nearby as differences of sums from the start.
+        total = np.zeros((len(values), len(row) + 1))
+        np.cumsum(values, axis=1, out=total[:, 1:])
+        index = np.arange(len(row))
+        first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
+        stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
+        stranger &= _in_other_channels(total[:, stop] - total[:, first], stop - first, channel)
+        lost[row[stranger]] = True
+    heights = by_run[:3]
+    share = np.maximum(heights[channel - 1], heights[channel - 2]) / np.maximum(heights[channel], 1.0)
     sure = lost.copy()
-    white = others_share(by_run[:3], channel) >= _SURELY
-    sure[row[np.where(by_run[3] > _CLIPPED * by_run[5], coloured, ~white)[run]]] = False
+    sure[row[np.where(by_run[3] > _CLIPPED * count, coloured, share < _SURELY)[run]]] = False
     return lost, sure
 
 
@@ -239,30 +238,14 @@ def _white_beside(image: U8, row: Index, middle: Index, channel: int, clipped: M
     return white
 
 
-def _sums(values: NDArray[np.float64], run: Index) -> NDArray[np.float64]:
-    """Sums (6, R) of values (6, N) over the rows of each run."""
-    return np.array([np.bincount(run, value) for value in values])
-
-
-def _sums_nearby(values: NDArray[np.float64], run: Index) -> NDArray[np.float64]:
-    """Sums (6, N) of values (6, N) over the rows of each row's run that are near it."""
-    # As differences of sums from the start.
-    total = np.zeros((len(values), len(run) + 1))
-    np.cumsum(values, axis=1, out=total[:, 1:])
-    index = np.arange(len(run))
-    first = np.maximum(index - _NEARBY, np.searchsorted(run, run))
-    stop = np.minimum(index + _NEARBY + 1, np.searchsorted(run, run, side="right"))
-    nearby: NDArray[np.float64] = total[:, stop] - total[:, first]
-    return nearby
-
-
-def _in_other_channels(total: NDArray[np.float64], channel: int) -> Mask:
+def _in_other_channels(total: NDArray[np.float64], rows: Index, channel: int) -> Mask:
     """Whether parts stand out in another channel, or take light there.
 
     Args:
-        total: (6, N) sums of heights by channel, of clipped rows, of heights that beams would have, of rows.
+        total: (5, N) sums of heights by channel, of clipped rows, of heights that beams would have.
+        rows: (N,) of the parts.
     """
-    own, others, rows = total[channel], total[:3][[channel - 1, channel - 2]], total[5]
+    own, others = total[channel], total[:3][[channel - 1, channel - 2]]
     takes = own - others.min(axis=0) > _TAKES[0] * np.maximum(own, total[4]) + _TAKES[1] * rows
     in_other: Mask = ((others.max(axis=0) > _STRANGER * own) | takes) & (total[3] < _CLIPPED * rows)
     return in_other

@@ -16,9 +16,6 @@ Index = NDArray[np.intp]
 _FLANK = 15  # [grey levels] that a flank must rise by
 HALF = 9  # [px] samples on either side of a line that its colour is measured from
 _SMEAR = 5  # [px] on either side of a line that its colour is smeared over
-_CORE = 4  # [px] on either side of a line that say nothing of what is beside it
-# What a line must rise by, in what a pattern leaves unexplained beside it; and what the pattern varies by, in those.
-_TELLS, _VARIES = 5.0, 0.3
 _EDGE = 0.5  # height of an edge of brightness, over the line's, that its light cannot be told across
 
 
@@ -28,12 +25,6 @@ def heights_of(image: U8, row: Index, column: Index) -> tuple[F32, NDArray[np.in
     core = y[HALF - 2] + y[HALF - 1] + y[HALF] + y[HALF + 1] + y[HALF + 2]
     side = y[0] + y[1] + y[-2] + y[-1]
     return core * np.float32(0.2) - side * np.float32(0.25), y[HALF]
-
-
-def others_share(light: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
-    """What light (3, N) has in the other channels where it is highest, over what it has in the laser's (N,)."""
-    share: NDArray[np.floating] = np.maximum(light[channel - 1], light[channel - 2]) / np.maximum(light[channel], 1.0)
-    return share
 
 
 def light_added(y: F32, channel: int) -> F32:
@@ -54,44 +45,12 @@ def light_added(y: F32, channel: int) -> F32:
         beside = y[[HALF - 5, HALF - 4, HALF + 4, HALF + 5], channel].sum(axis=0)
         own = 0.2 * (near - 1.75 * beside)
         again = smeared - smeared[channel] + own
-        purer = others_share(again, channel) < others_share(added[:, at], channel)
-        added[:, at[purer]] = again[:, purer]
+        share = [
+            np.maximum(h[channel - 1], h[channel - 2]) / np.maximum(h[channel], 1.0) for h in (again, added[:, at])
+        ]
+        better = at[share[0] < share[1]]
+        added[:, better] = again[:, share[0] < share[1]]
     return added
-
-
-def beyond_pattern(y: F32, channel: int) -> F32:
-    """Light (3, N) by channel that places of profiles y (2 HALF + 1, 3, N) add to narrow stripes; 0 where none is told.
-
-    Of stripes a channel has more by a multiple of what another one has more, which is told beside the place. The other
-    channel's light there explains as much of the laser's, but only as far as it is as bright beside it: of something
-    brighter no pattern tells. What is left of the laser's channel must stand out of what is left beside it.
-    """
-    near = y[HALF - 2 : HALF + 3].mean(axis=0)
-    beside = np.concatenate([y[: HALF - _CORE], y[HALF + _CORE + 1 :]])
-    brightest = 0.5 * np.partition(beside, -2, axis=0)[-2:].sum(axis=0)
-    added = np.maximum(y[HALF - 1 : HALF + 2].mean(axis=0) - brightest, 0.0)
-    usual = beside.mean(axis=0)
-    beside, near = beside - usual, near - usual
-    # That of the others which rises more.
-    first, second = channel - 1, channel - 2
-    other = np.where(near[first] > near[second], beside[:, first], beside[:, second])
-    there = np.clip(np.maximum(near[first], near[second]), other.min(axis=0), other.max(axis=0))
-    varies = np.einsum("ij,ij->j", other, other)
-    slope = np.maximum(np.einsum("ij,ij->j", other, beside[:, channel]), 0.0) / np.maximum(varies, np.float32(1.0))
-    scatter = np.sqrt(np.square(beside[:, channel] - slope * other).mean(axis=0))
-    light = near[channel] - slope * there
-    told = (light > _TELLS * scatter) & (varies > len(other) * np.square(_VARIES * light))
-    # Cut samples have no colour.
-    told &= y.max(axis=(0, 1)) < COLOURLESS
-    added[channel] = light
-    return np.where(told, added, np.float32(0.0))
-
-
-def purest_light(y: F32, light: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
-    """The light (3, N) of places of profiles y (2 HALF + 1, 3, N), or what is beyond a pattern where that is purer."""
-    beyond = beyond_pattern(y, channel)
-    purer = (beyond[channel] > 0) & (others_share(beyond, channel) < others_share(light, channel))
-    return np.where(purer, beyond, light)
 
 
 def flank_lead(y: NDArray[np.floating], channel: int, *, purer_side: bool = False) -> tuple[F32, F32]:
