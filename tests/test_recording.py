@@ -17,7 +17,8 @@ from recorded_shots import CALIBRATION, START_NS, made_up_shots, record
 
 from scanmap.calibration import Calibration
 from scanmap.errors import CalibrationError, RecordingError
-from scanmap.recording import Recorder, RecordingParams, describe, open_source, whole_ns
+from scanmap.recording import Recorder, RecordingParams, describe, messages, open_source, whole_ns
+from scanmap.recording.definitions import DEFINITIONS
 from scanmap.shot import Shot
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -324,3 +325,12 @@ def test_plans_of_others_are_shown_as_they_are(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", made_up_shots(1), metadata={"note": "ü"}, plan={"bearings": [0, 1]})
     assert json.dumps(describe(path).plan) == '{"bearings": [0, 1]}'
     assert describe(path).versions["note"] == "ü"
+
+
+@pytest.mark.parametrize("release", ["ROS2_HUMBLE", "ROS2_KILTED", "LATEST"])
+def test_messages_are_those_of_ros(release: str) -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    theirs = get_typestore(Stores[release])
+    for name in DEFINITIONS:
+        assert messages.definition(name).decode() == theirs.generate_msgdef(name, ros_version=2)[0]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration
+from scanmap.recording.definitions import DEFINITIONS
 from scanmap.recording.layout import CAMERA_INFO, COMPRESSED_IMAGE, DIAGNOSTIC_ARRAY, JOINT_STATE, TF_MESSAGE
 from scanmap.shot import image_format
 
@@ -50,10 +51,13 @@ class Fault(NamedTuple):
 
 @cache
 def typestore() -> Any:
-    """The ROS 2 message definitions (Humble; the types used here are the same in every release since)."""
-    from rosbags.typesys import Stores, get_typestore
+    """What rosbags makes of the message definitions."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.EMPTY)
+    for name, fields in DEFINITIONS.items():
+        store.register(get_types_from_msg(fields, name))
+    return store
 
 
 def definition(message_type: str) -> bytes:

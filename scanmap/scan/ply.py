@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -33,6 +35,7 @@ _LINE = 200
 _NUMBERS_A_LINE = 8
 # More than any camera and stage give; a damaged header must not take the machine's memory.
 _MAX_ROWS, _MAX_CELLS = 20_000, 2**27
+_BLOCKS_AHEAD = 2  # of records, made while others are written
 
 
 def write_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> None:
@@ -48,8 +51,8 @@ def write_ply(scan: Scan, file: BinaryIO, params: ScanParams | None = None) -> N
 def vertex_blocks(scan: Scan, params: ScanParams | None = None, columns: int = 64) -> Iterator[NDArray[Any]]:
     """The scan's points as records of `VERTEX`, bearing by bearing, row by row, some columns at a time."""
     normal = normals(scan, params)
-    for start in range(0, len(scan), columns):
-        block = slice(start, start + columns)
+
+    def records_of(block: slice) -> NDArray[Any]:
         bearing, row = np.nonzero(scan.valid[block])
         records = np.empty(len(bearing), VERTEX)
         floats = records.view(np.float32).reshape(len(bearing), VERTEX.itemsize // 4)
@@ -57,8 +60,18 @@ def vertex_blocks(scan: Scan, params: ScanParams | None = None, columns: int = 6
         floats[:, 3:6] = np.nan_to_num(normal[block][bearing, row])
         for k, values in enumerate((scan.intensity, scan.sigma_m, scan.range_m, scan.column_px)):
             floats[:, 6 + k] = values[block][bearing, row]
-        records["bearing_index"], records["row"] = bearing + start, row
-        yield records
+        records["bearing_index"], records["row"] = bearing + block.start, row
+        return records
+
+    # Copying whole arrays leaves the interpreter's lock.
+    ahead: deque[Future[NDArray[Any]]] = deque()
+    with ThreadPoolExecutor(_BLOCKS_AHEAD, thread_name_prefix="vertices") as pool:
+        for start in range(0, len(scan), columns):
+            ahead.append(pool.submit(records_of, slice(start, start + columns)))
+            if len(ahead) > _BLOCKS_AHEAD:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
 
 
 def read_ply(path: Path | str) -> Scan:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -200,8 +201,7 @@ class Job:
 
         def report(step: Step) -> None:
             found = int(np.isfinite(step.profile.range_m).sum())
-            bearing = float(np.degrees(step.shot.bearing))
-            progress(Progress(len(scan), self.total, bearing, found, scan.rows))
+            progress(Progress(len(scan), self.total, float(np.degrees(step.shot.bearing)), found, scan.rows))
 
         sinks: list[Sink] = [collect]
         if self.view is not None:
@@ -234,8 +234,10 @@ class Job:
         summary = summarise(clean, self.calibration)
         grid, files, unwritten = None, list[Path](), list[tuple[Path, str]]()
         if summary.points:
-            grid = OccupancyGrid.from_scan(clean, self.config.grid)
-            files, unwritten = write_results(clean, grid, self.outputs, self.config.scan)
+            with ThreadPoolExecutor(1) as beside:
+                drawn = beside.submit(OccupancyGrid.from_scan, clean, self.config.grid)
+                files, unwritten = write_results(clean, drawn.result, self.outputs, self.config.scan)
+            grid = drawn.result()
         else:
             error = error or RecordingError(self._pointless(summary))
         self._close_view(clean, grid, files, unwritten)

@@ -87,11 +87,12 @@ class Outputs:
 
 
 def write_results(
-    scan: Scan, grid: OccupancyGrid | None, outputs: Outputs, params: ScanParams
+    scan: Scan, grid: Callable[[], OccupancyGrid], outputs: Outputs, params: ScanParams
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Write clouds and map. One that fails does not cost the others.
 
     Args:
+        grid: gives the map; asked for once the clouds are written.
         params: what normals and meshes are made by.
 
     Returns:
@@ -110,7 +111,7 @@ def write_results(
 
     for path in outputs.clouds:
         attempt(path, partial(write, scan, path, params))
-    if outputs.map is not None and grid is not None:
+    if outputs.map is not None:
         map_path = outputs.map
-        attempt(map_path, lambda: save_map(grid, map_path, image_format=outputs.map_image, mode=outputs.map_mode))
+        attempt(map_path, lambda: save_map(grid(), map_path, image_format=outputs.map_image, mode=outputs.map_mode))
     return written, failed
