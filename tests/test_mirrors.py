@@ -13,8 +13,10 @@ from rooms_by_rays import Box, distances
 from scanmap.config import load
 from scanmap.geometry import HeadMount
 from scanmap.laserline import Reason
-from scanmap.scan import Scan
+from scanmap.scan import Scan, ScanParams
+from scanmap.scan.leaning_mirrors import judged
 from scanmap.scan.mirrors import find_mirrors, without_mirrors
+from scanmap.scan.panorama import Panorama
 from scanmap.session.job import finished_scan
 from scanmap.triangulation import Profile
 
@@ -46,23 +48,27 @@ def swept(
     turn_deg: float = 180.0,
     rows: int = 240,
     seed: int = 1,
+    lean_deg: float = 0.0,
 ) -> Swept:
-    """Sweep of a room with mirrors before its east wall: each a pane, and how far it stands before the wall [m]."""
+    """Sweep of a room with mirrors before its east wall: each a pane, and how far its top is before the wall [m]."""
     rng, mount, image = np.random.default_rng(seed), HeadMount(), list[NDArray[np.bool_]]()
     scan = Scan(mount, rows)
     slope = np.tan(np.radians(np.linspace(25.0, -25.0, rows)))
     head = np.stack([np.ones(rows), np.zeros(rows), slope], axis=1) / np.hypot(1.0, slope)[:, None]
+    lean = np.radians(lean_deg)
+    normal = np.array([-np.cos(lean), 0.0, np.sin(lean)])
     for bearing in np.radians(np.arange(-60.0, turn_deg - 60.0 + 1e-6, step_deg)):
         T = mount.T_world_head(bearing)
         way = head @ T[:3, :3].T
         reach = distances(np.zeros(3), way, room, boxes)
         seen_in = np.zeros(rows, bool)
         for ((y0, z0), (y1, z1)), before in mirrors:
+            depth = way @ normal
             with np.errstate(divide="ignore"):
-                to_pane = np.where(way[:, 0] > 0, (EAST - before) / way[:, 0], np.inf)
+                to_pane = np.where(depth < 0, normal @ [EAST - before, 0.0, z1] / depth, np.inf)
             at = np.where(np.isfinite(to_pane), to_pane, 0.0)[:, None] * way
             hit = (to_pane < reach) & (at[:, 1] > y0) & (at[:, 1] < y1) & (at[:, 2] > z0) & (at[:, 2] < z1)
-            onward = distances(at, way * [-1.0, 1.0, 1.0], room, boxes)
+            onward = distances(at, way - 2.0 * depth[:, None] * normal, room, boxes)
             reach = np.where(hit, to_pane + onward, reach)
             seen_in |= hit
         sigma = 5e-4 * reach**2  # the thesis head's, at 0.04 px
@@ -123,6 +129,32 @@ def test_the_mirror_is_found_where_it_hangs() -> None:
     assert mirror.plane[3] == pytest.approx(EAST - 0.02, abs=0.021)
     assert mirror.agree > 50
     assert mirror.deny < 0.01 * mirror.agree
+
+
+LEANING: Pane = ((0.9, -0.95), (1.6, 0.7))
+
+
+@pytest.mark.parametrize(
+    ("lean_deg", "settings"), [(7.5, {}), (10.0, {"turn_deg": 300.0}), (8.0, {"step_deg": 3.0, "rows": 600, "seed": 2})]
+)
+def test_a_mirror_that_leans_is_told_by_what_is_seen_in_it(lean_deg: float, settings) -> None:
+    scan, image = swept(mirrors=[(LEANING, 0.02)], lean_deg=lean_deg, **settings)
+    [mirror] = find_mirrors(scan)
+    lean = np.radians(lean_deg)
+    normal = np.array([-np.cos(lean), 0.0, np.sin(lean)])
+    assert mirror.plane[:3] @ normal > np.cos(np.radians(0.5))
+    assert mirror.plane @ [EAST - 0.02, 1.2, LEANING[1][1], 1.0] == pytest.approx(0.0, abs=0.03)
+    assert mirror.cells[image].mean() > 0.9
+    assert not mirror.cells[~image].any()
+
+
+@pytest.mark.parametrize(("pane", "furnished"), [(((-0.9, 0.0), (-0.5, 0.6)), False), (HANGING, True)])
+def test_what_agrees_beyond_one_wall_is_told_apart(pane: Pane, furnished: bool) -> None:
+    scan, image = swept(boxes=FURNITURE if furnished else (), mirrors=[(pane, 0.01)], turn_deg=358.0)
+    fit = judged(Panorama(scan, ScanParams()), image, np.array([-1.0, 0.0, 0.0, EAST - 0.01]), scan.valid & ~image)
+    assert fit.hanging == 0
+    assert fit.agree >= 20
+    assert fit.beyond > 20 if furnished else fit.beyond < 3
 
 
 def test_the_room_behind_a_door_beside_a_mirror_stays() -> None:

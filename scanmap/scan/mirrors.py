@@ -13,7 +13,8 @@ those of a line. Three things tell it from a room behind an opening:
 
 What the scan did not see, behind furniture or in the half that was not swept, says nothing either way. Where nothing
 compares, the cut alone is enough if upper and lower ends are seen all along: a wall is as thick as it is. And pictures
-prove mirrors whose ends are out of view (`second_lines`).
+prove mirrors whose ends are out of view (`second_lines`). Mirrors that lean on a wall have planes of their own
+(`leaning_mirrors`).
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from numpy.typing import NDArray
 
 from scanmap.laserline import Reason
 from scanmap.scan.floor_images import floor_images
+from scanmap.scan.leaning_mirrors import judged, leaning_mirror
 from scanmap.scan.openings import BEHIND_M, Opening, openings, walls
-from scanmap.scan.panorama import Panorama
+from scanmap.scan.panorama import Panorama, patches
 from scanmap.scan.range_image import Scan, ScanParams
 from scanmap.scan.second_lines import Pictures, shown
 from scanmap.scan.streaks import level_of, streaks
@@ -38,10 +40,16 @@ Mask = NDArray[np.bool_]
 _COLUMNS, _ROWS = 240, 300  # the range image is thinned to about this before anything is looked for
 _OFF_AXIS_M = 0.2  # a head farther from the axis than this sees a turntable, not a room
 _OFFSETS_M = (0.0, 0.01, -0.01, 0.02, -0.02, 0.03, 0.04)  # of the mirror before its wall
-_PATCH_M = 0.15  # what lies in one cube of this size counts once
-_PATCHES = 20  # of upright surfaces, that must agree
+_PATCHES = 20  # cubes of upright surfaces, that must agree
 _SUPPORT = 0.15  # of all patches of an opening; where most reflects to what was not swept, a few prove nothing
+# Of mirrors that lean: share of an opening's patches that must agree; how many beyond one wall, in openings that are
+# not cut and in those that are; share that may deny.
+_MOST, _BEYOND, _AGAINST = 0.4, (22, 15), 0.1
+_ASKED = 0.7  # share of an opening that was asked as that of another wall
 _AGREE = 0.97  # share of those that agree or deny, that must agree
+# Where no frame is seen all around, so many patches must agree beyond one wall; share of an opening's own patches that
+# must agree where they do not, and where they do.
+_SURPLUS, _SUPPORT_OWN = 5, (0.5, 0.25)
 _MOSTLY, _LITTLE = 0.3, 0.1  # of a bearing's cells that hang in the air once reflected; that must tell
 _HANGING = 0.1  # share of all cells that may hang, at most
 _AS_HIGH = 0.6  # share of the cells of other bearings, where none tells
@@ -73,19 +81,22 @@ def without_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pict
 
 
 def find_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Pictures | None = None) -> list[Mirror]:
-    """Upright mirrors on the walls of a scan whose bearings ascend, and its floor; with the cells that show images."""
+    """Mirrors on the walls of a scan whose bearings ascend, and its floor; with the cells that show images."""
     every, each = max(1, len(scan) // _COLUMNS), max(1, scan.rows // _ROWS)
     thin = _thinned(scan, every, each)
     if min(len(thin), thin.rows) < 3 or not thin.valid.any() or np.hypot(*scan.mount.offset_m[:2]) > _OFF_AXIS_M:
         return []
     seen = Panorama(thin, params or ScanParams())
-    found: list[Mirror] = []
+    found, asked = list[Mirror](), np.zeros_like(seen.valid)
     planes = walls(seen.points[seen.valid], np.nan_to_num(seen.normals[seen.valid]))
     for wall in planes:
         for opening in openings(seen, wall):
             mirror = _likely(seen, opening, wall) if opening.cut else None
             if mirror is None and pictures is not None:
                 mirror = _pictured(scan, pictures, seen, opening, wall)
+            if mirror is None and not (asked & opening.cells).sum() > _ASKED * opening.cells.sum():
+                asked |= opening.cells
+                mirror = _leaning(seen, opening, wall)
             if mirror is not None:
                 seen.valid[mirror.cells] = False
                 found.append(mirror._replace(cells=_behind(scan, wall, mirror.cells, every, each)))
@@ -104,12 +115,31 @@ def _likely(seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
     """The mirror that an opening is, where the room itself proves it; its cells are those of the panorama."""
     points = seen.points[opening.cells]
     offset, agree, deny = _likeness(seen, opening.cells, wall)
-    patches = len(np.unique(_patches(points)))
-    alike = agree >= max(_PATCHES, _SUPPORT * patches) and agree >= _AGREE * (agree + deny)
+    cubes = len(np.unique(patches(points)))
+    plane = wall - [0.0, 0.0, 0.0, offset]
+    alike = agree >= max(_PATCHES, _SUPPORT * cubes) and agree >= _AGREE * (agree + deny)
+    if alike and not opening.framed:
+        # One wall of another room lies on one of this room's sooner or later.
+        own = judged(seen, opening.cells, plane, seen.valid)
+        least = max(_PATCHES / 2, _SUPPORT_OWN[own.beyond >= _SURPLUS] * cubes)
+        alike = own.agree >= least and opening.cells.any(axis=1).sum() > 1
     # No wall is cut without showing how thick it is; and what is shallow hangs in the air once reflected.
-    if alike or (opening.framed and deny <= _FEW * patches):
-        return Mirror(wall - [0.0, 0.0, 0.0, offset], opening.cells, agree, deny)
+    if alike or (opening.framed and deny <= _FEW * cubes):
+        return Mirror(plane, opening.cells, agree, deny)
     return None
+
+
+def _leaning(seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
+    """The mirror leaning on a wall that an opening is, where the room itself proves it."""
+    cubes = len(np.unique(patches(seen.points[opening.cells])))
+    if cubes < _PATCHES:
+        return None
+    fit = leaning_mirror(seen, opening.cells, wall)
+    if fit is None or fit.agree < max(_PATCHES, _MOST * cubes) or fit.beyond < _BEYOND[opening.cut]:
+        return None
+    there, missing = _there(seen, opening.cells, fit.plane, 0.0)
+    agree, deny = fit.agree + there, fit.hanging + missing
+    return Mirror(fit.plane, opening.cells, agree, deny) if deny <= _AGAINST * (agree + deny) else None
 
 
 def _pictured(scan: Scan, pictures: Pictures, seen: Panorama, opening: Opening, wall: F64) -> Mirror | None:
@@ -159,18 +189,27 @@ def _likeness(seen: Panorama, cells: Mask, wall: F64) -> tuple[float, int, int]:
     Points of the hole must lie on the room, not hang in it; and of the room before the wall nothing that must be seen
     in the mirror may be missing there.
     """
-    points, tolerance = seen.points[cells], seen.tolerance(cells)
     best, least = (0.0, 0, 0), -np.inf
     for offset in _OFFSETS_M:
-        image = _reflected(points, wall, offset)
-        on, upright, through = seen.images(image, tolerance, seen.valid)
-        agreeing = len(np.unique(_patches(image[upright])))
-        denying = len(np.setdiff1d(_patches(image[through]), _patches(image[on])))
+        agreeing, denying = _lying(seen, cells, wall, offset)
         if agreeing - 2 * denying > least:
             best, least = (offset, agreeing, denying), agreeing - 2 * denying
     offset, agree, deny = best
     if not agree:
         return best
+    there, missing = _there(seen, cells, wall, offset)
+    return offset, agree + there, deny + missing
+
+
+def _lying(seen: Panorama, cells: Mask, wall: F64, offset: float) -> tuple[int, int]:
+    """In how many patches points of a hole, reflected `offset` before a wall, lie on something upright, or hang."""
+    image = _reflected(seen.points[cells], wall, offset)
+    on, upright, through = seen.images(image, seen.tolerance(cells), seen.valid)
+    return len(np.unique(patches(image[upright]))), len(np.setdiff1d(patches(image[through]), patches(image[on])))
+
+
+def _there(seen: Panorama, cells: Mask, wall: F64, offset: float) -> tuple[int, int]:
+    """In how many patches the mirror shows what of the room it must show, and in how many that is missing in it."""
     # Between the bearings a narrow thing may be seen in one of two views only: it is not asked for.
     wide = np.zeros_like(cells)
     with np.errstate(invalid="ignore"):
@@ -180,20 +219,13 @@ def _likeness(seen: Panorama, cells: Mask, wall: F64) -> tuple[float, int, int]:
     wide &= seen.points @ wall[:3] + wall[3] > BEHIND_M
     image = _reflected(seen.points[wide], wall, offset)
     _, upright, missing = seen.images(image, seen.tolerance(wide), cells)
-    there = len(np.unique(_patches(image[upright])))
-    return offset, agree + there, deny + len(np.unique(_patches(image[missing])))
+    return len(np.unique(patches(image[upright]))), len(np.unique(patches(image[missing])))
 
 
 def _reflected(points: F64, wall: F64, offset: float) -> F64:
     """Points (N, 3) reflected at the plane `offset` before a wall."""
     image: F64 = points - 2.0 * (points @ wall[:3] + wall[3] - offset)[:, None] * wall[:3]
     return image
-
-
-def _patches(points: F64) -> NDArray[np.int64]:
-    """Number (N,) of the cube of space that each point lies in."""
-    number: NDArray[np.int64] = np.floor(points / _PATCH_M).astype(np.int64) @ np.array([1, 4096, 4096**2])
-    return number
 
 
 def _closed(cells: Mask) -> NDArray[np.uint8]:
