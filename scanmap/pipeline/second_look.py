@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import BLOCK, Reason, ridge_of
+from scanmap.pipeline.cut_beams import put_back
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
@@ -87,6 +88,8 @@ class SecondLook:
     def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
 
+        Lines of beams that an edge cut are put back where they belong.
+
         Args:
             scan: holds the profiles of the steps seen, in their order.
             shots: the same shots once more; None where they are gone, and points can only be given up.
@@ -111,6 +114,7 @@ class SecondLook:
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
         if known.shown and total >= _HARD * scan.valid.sum():
             self._choose(scan, views, known._replace(choosing=True), shots)
+        put_back(scan, self._pipeline, self._reflectance, [shape[1] for shape in self._shape], asked)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
