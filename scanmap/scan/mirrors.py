@@ -157,18 +157,19 @@ def _pictured(scan: Scan, pictures: Pictures, seen: Panorama, opening: Opening, 
 def _beside_left(seen: Panorama, opening: Opening, plane: F64) -> tuple[Mask, int]:
     """The cells that are seen in a mirror, without the bearings beside it that hang together with them.
 
-    What hangs in the air once reflected is no image. Floor, ceiling and walls square to the mirror lie on themselves:
-    where nothing else is seen at an end, less of it than elsewhere and no frame around, they stay. Returns also how
-    many cells hang.
+    What hangs in the air once reflected is no image. Floor and ceiling lie on themselves: where little else is seen at
+    an end that lies on something, less of it than elsewhere and no frame around, they stay. Returns also how many cells
+    hang.
     """
     cells = opening.cells
     image = _reflected(seen.points[cells], plane, 0.0)
-    through = np.zeros_like(cells)
-    through[cells] = seen.images(image, seen.tolerance(cells), seen.valid)[2]
+    upright, through = np.zeros((2, *cells.shape), bool)
+    upright[cells], through[cells] = seen.images(image, seen.tolerance(cells), seen.valid)[1:]
     telling = cells & (np.abs(np.nan_to_num(seen.normals @ plane[:3])) > _TELLING)
     whole = cells.sum(axis=1)
     hangs = through.sum(axis=1) > _MOSTLY * whole
-    inside = (opening.framed | (telling.sum(axis=1) > _LITTLE * whole)) & ~hangs & (whole > 0)
+    inside = opening.framed | (telling.sum(axis=1) > _LITTLE * whole) | (upright.sum(axis=1) > _MOSTLY * whole)
+    inside &= ~hangs & (whole > 0)
     inside |= (whole >= _AS_HIGH * (np.median(whole[inside]) if inside.any() else np.inf)) & ~hangs
     ends = np.flatnonzero(inside)
     kept = cells & ~hangs[:, None]
