@@ -101,7 +101,10 @@ def find_mirrors(scan: Scan, params: ScanParams | None = None, pictures: Picture
                 seen.valid[mirror.cells] = False
                 found.append(mirror._replace(cells=_behind(scan, wall, mirror.cells, every, each)))
                 if pictures is not None:
+                    # Where it ends, little is seen in it.
                     hole = cv2.dilate(_closed(mirror.cells), _AROUND).astype(bool)
+                    rows = np.flatnonzero(hole.any(axis=0))
+                    hole[hole.any(axis=1), rows[0] : rows[-1] + 1] = True
                     found[-1].cells[:] |= streaks(scan, pictures, seen, mirror.plane, hole)
     floor = level_of(seen, 1.0)
     if pictures is not None and floor is not None:
@@ -149,7 +152,7 @@ def _pictured(scan: Scan, pictures: Pictures, seen: Panorama, opening: Opening, 
     if not proof.proves(cut=opening.cut):
         return None
     cells, hanging = _beside_left(seen, opening, proof.plane)
-    if hanging > _HANGING * cells.sum():
+    if not cells.any() or hanging > _HANGING * cells.sum():
         return None
     return Mirror(proof.plane, cells, proof.lines, hanging)
 
