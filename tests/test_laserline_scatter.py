@@ -48,6 +48,6 @@ def test_what_a_shaken_camera_leaves_grows_with_the_rooms_contrast() -> None:
     rng, column = np.random.default_rng(2), np.repeat([100.0, 200.0], 120)
     room = np.tile(np.select([np.arange(300) < 100, np.arange(300) < 200], [30.0, 60.0], 210.0), (240, 1))
     on, off = (np.rint(room + rng.normal(0.0, 1.5, room.shape)).astype(np.uint8) for _ in range(2))
-    ratio, _ = standing_out(column, np.full(240, 20.0), on, off, 1.0)
+    ratio = standing_out(column, np.full(240, 20.0), on, off, 1.0)
     for rows, contrast in ((slice(0, 120), 30.0), (slice(120, 240), 150.0)):
         assert np.median(ratio[rows]) == pytest.approx(20.0 / np.hypot(1.5, contrast / 25.0), rel=0.1)

@@ -23,7 +23,6 @@ _CONTRAST = 16  # [grey levels] from which on a place has any
 _BRIGHTEST = 240  # [grey levels] brighter ones are cut
 _ROW_STEP = 8
 _FEW = 50
-_RIPPLE_REACH, _RIPPLE = 6, 0.5  # [px] around a place, and the part of what is missing there that counts
 _SHARE = 0.04  # of a contrast that a shaken camera leaves besides
 # A run, asked along it as a whole: rows that it has at least, and how far they lie from a straight line.
 _RUN_ROWS, _STRAIGHT_PX = 4, 0.8
@@ -36,16 +35,16 @@ _HIGHER, _STEEPER = 2.0, 1.5
 def told_from_edges(line: LaserLine, weak: Mask, sight: Sight) -> tuple[LaserLine, Mask]:
     """The line of one picture without what edges of the room leave of its laser-off frame; and rows (H,) still weak."""
     assert sight.off is not None
-    standing, with_ripple = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
+    standing = standing_out(line.column_px, line.peak, sight.on, sight.off, sight.gain)
     line = without(line, standing < _STANDS_OUT[0], Reason.AMBIGUOUS)
-    disturbed = with_ripple < _STANDS_OUT[1]
+    disturbed = standing < _STANDS_OUT[1]
     borne = borne_out(line.column_px, disturbed | weak, _BLOCKS_ROWS, sight.lit, sight.off, sight.gain)
     disturbed &= ~borne
     line = without(line, crumbs(line.column_px, disturbed, sight.height, _BLOCKS_ROWS), Reason.AMBIGUOUS)
     return line, (weak | disturbed) & ~borne
 
 
-def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> tuple[F64, F64]:
+def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float) -> F64:
     """Height of each row's line over what a shaken or recompressed edge leaves there in the difference.
 
     Args:
@@ -54,12 +53,11 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
         gain: that the background is multiplied by.
 
     Returns:
-        Heights (H,) in standard deviations of what is left, infinite where the room is even or has no line; and the
-        same with what the row itself shows of it, too much for one row to be judged by.
+        Heights (H,) in standard deviations of what is left, infinite where the room is even or has no line.
 
     What remains where the room has contrast is measured in the two pictures themselves.
     """
-    ratio, beside = (np.full(len(column), np.inf) for _ in range(2))
+    ratio = np.full(len(column), np.inf)
     row = np.flatnonzero(np.isfinite(column))
     left = _remaining(image, background, gain) if row.size else 0.0
     if left > 0.0:
@@ -67,14 +65,9 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
         x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, background.shape[1] - 1)
         contrast = gain * np.ptp(background[row[:, None], x].astype(np.float32), axis=1)
         uneven = contrast > _CONTRAST
-        row, middle = row[uneven], middle[uneven]
-        x = np.clip(middle[:, None] + np.arange(-_RIPPLE_REACH, _RIPPLE_REACH + 1), 0, background.shape[1] - 1)
-        added = image[row[:, None], x] - gain * background[row[:, None], x].astype(np.float32)
-        # A laser adds light and never takes any: what is missing beside a place tells how much too much is there.
-        ripple = np.median(added, axis=1) - added.min(axis=1)
-        rest = np.hypot(left, _SHARE * contrast[uneven])
-        ratio[row], beside[row] = peak[row] / rest, peak[row] / np.hypot(rest, _RIPPLE * ripple)
-    return ratio, beside
+        row = row[uneven]
+        ratio[row] = peak[row] / np.hypot(left, _SHARE * contrast[uneven])
+    return ratio
 
 
 def _remaining(image: U8, background: U8, gain: float) -> float:
