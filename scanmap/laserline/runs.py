@@ -116,13 +116,12 @@ def _blobs_of_one(wide: Array, across: Array, height: Array, strong: Mask, certa
 
 
 def frayed(column: Array, width: Array, peak: Array, sigma: Array, rows: int) -> Mask:
-    """Rows (P H,) at depth edges in which the light of two surfaces, or half of one's, was taken for the line.
+    """Rows (P H,) at depth edges in which a part of the beam was taken for the line.
 
     Args:
         column, width, peak, sigma: (P H,) of pictures of `rows` rows below each other.
 
-    Ends of a run that are dim and have another width than the rows further in, and rows dimmer and wider than those
-    two above and two below.
+    These are ends of a run that are dim and have another width than the rows further in.
     """
     mask = np.zeros(len(column), bool)
     found = np.isfinite(column).nonzero()[0]
@@ -138,13 +137,6 @@ def frayed(column: Array, width: Array, peak: Array, sigma: Array, rows: int) ->
             row = found[end + inward * k]
             odd = np.abs(width[row] - usual) > 0.3 * usual + 2.0 * sigma[row]
             mask[row[odd & (peak[row] < 0.6 * bright)]] = True
-    width, peak, sigma = (values.reshape(-1, rows) for values in (width, peak, sigma))
-    wide = np.fmax(width[:, :-4], width[:, 4:])
-    bright = np.fmax(peak[:, :-4], peak[:, 4:])
-    width, peak, sigma = width[:, 2:-2], peak[:, 2:-2], sigma[:, 2:-2]
-    with np.errstate(invalid="ignore"):
-        shared = (width > 1.35 * wide + 0.1 + 4.0 * sigma) & (peak < 0.8 * bright) & (peak < _NEAR)
-    mask.reshape(-1, rows)[:, 2:-2] |= shared
     return mask
 
 
