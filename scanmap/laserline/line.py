@@ -53,8 +53,7 @@ _FEWEST_ROWS = (4, BLOCK + 2)
 _CORE_SHARE, _CORE_HALF = 0.4, 13
 # Share of its rows in which a picture must show the line to be thought of the laser's colour.
 _MOSTLY = 0.5
-# Rounds in which the line is followed, and how far from there a row may show it.
-_ROUNDS, _ON_TRACK_PX = 3, 2.0
+_ROUNDS = 3  # in which the line is followed
 # A row too dim to be believed alone is known to this [px], and counts where the line goes on above and below.
 _DIM_PX = 0.8
 
@@ -295,10 +294,8 @@ def _go_on(
         if not row.size:
             return
         more, other = _located(sight, (row, column), params)
-        on_track = np.zeros(len(free), bool)
-        on_track[row] = np.abs(more.column_px[row] - column) < _ON_TRACK_PX
-        on_track &= (more.width_px < runs.NO_BLOB_PX + np.nanmedian(line.width_px)) & free
-        more = without(_within(more, window), ~on_track, Reason.WEAK)
+        line_like = (more.width_px < runs.NO_BLOB_PX + np.nanmedian(line.width_px)) & free
+        more = without(_within(more, window), ~line_like, Reason.WEAK)
         if sight.image is not None:
             none = np.zeros(len(free), bool)
             more = without(more, strangers(more, sight.image, sight.channel, none, len(free))[1], Reason.WEAK)
