@@ -170,8 +170,12 @@ def _beside_left(seen: Panorama, opening: Opening, plane: F64) -> tuple[Mask, in
     upright[cells], through[cells] = seen.images(image, seen.tolerance(cells), seen.valid)[1:]
     telling = cells & (np.abs(np.nan_to_num(seen.normals @ plane[:3])) > _TELLING)
     whole = cells.sum(axis=1)
-    hangs = through.sum(axis=1) > _MOSTLY * whole
-    inside = opening.framed | (telling.sum(axis=1) > _LITTLE * whole) | (upright.sum(axis=1) > _MOSTLY * whole)
+    hangs, borne_out = (some.sum(axis=1) > _MOSTLY * whole for some in (through, upright))
+    # Beyond a bearing that shows none of it there may be another opening: a door beside a wardrobe.
+    part = np.cumsum(whole == 0)
+    if len(np.unique(part[whole > 0])) > 1:
+        hangs |= ~np.isin(part, part[borne_out])
+    inside = opening.framed | (telling.sum(axis=1) > _LITTLE * whole) | borne_out
     inside &= ~hangs & (whole > 0)
     inside |= (whole >= _AS_HIGH * (np.median(whole[inside]) if inside.any() else np.inf)) & ~hangs
     ends = np.flatnonzero(inside)
