@@ -49,6 +49,7 @@ bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/hard_sweep.py
 	$(BIN)/python benchmarks/sweeps.py
 	$(BIN)/python benchmarks/mirrors.py
+	$(BIN)/python benchmarks/ablation.py
 
 lock:
 	uv lock
