@@ -153,7 +153,7 @@ def test_a_step_in_the_wall_moves_nothing() -> None:
 def test_a_narrower_line_that_is_where_it_should_be_stays() -> None:
     calibration = head()
     place, weight = cut_beam(1.0, 1.0)
-    thin = 0.3 * place, weight
+    thin = 0.6 * place, weight
     unmoved(calibration, rows_of(calibration, thin, 0.7), 0.0)
 
 
@@ -162,5 +162,11 @@ def test_another_face_darker_and_narrower_stays(moved_px: float) -> None:
     calibration = head()
     place, weight = cut_beam(1.0, 1.0)
     # What a post on the greater bearings' side leaves of a beam lies to the right of it, by less than that.
-    thin = 0.3 * place, weight
+    thin = 0.6 * place, weight
     unmoved(calibration, rows_of(calibration, thin, 0.6, moved_px), moved_px)
+
+
+def test_a_line_narrower_than_any_beam_leaves_stays() -> None:
+    calibration = head()
+    place, weight = cut_beam(1.0, 1.0)
+    unmoved(calibration, rows_of(calibration, (0.1 * place, weight), 0.75, 0.9), 0.9)

@@ -39,6 +39,7 @@ _MEANS = (0.95, 0.93)  # of light and width, above which means of a few rows nee
 _LEAST_LIGHT = 0.03  # of it, below which what is left is no beam's flank
 _SAME, _OTHER = 0.05, 0.12  # of its range, up to which a bearing's surface may be the next one's, and beyond which not
 _FLAT_PX = 0.2  # by which half of the points of a plane lie off it, at most
+_FITS, _FAR_OFF = 3, 4.0  # of a plane, and how many medians a point is off it that is none of its own
 _LEAST, _MOST = 0.6, 1.4  # how far points lie off the plane, in terms of what light and width foretell
 _UNKNOWN = 0.3  # of how far a line was moved
 
@@ -138,12 +139,15 @@ def _running_median(values: F64) -> F64:
 
 
 def _foretold(share: F64, narrow: F64, whole: F32) -> float:
-    """How far [px] a line was moved whose beam kept a `share` of its light and became narrower; of rows (N,)."""
+    """How far [px] a line was moved whose beam kept a `share` of its light and became narrower; of rows (N,).
+
+    Infinite where no beam could have become so narrow.
+    """
     f = float(np.median(share))
     t = NormalDist().inv_cdf(f)
     m = NormalDist().pdf(t) / f
-    gone = 1.0 - float(np.median(narrow)) ** 2
-    return float(np.nanmedian(whole)) * float(np.sqrt(min(gone / (t * m + m * m), 1.0))) * m
+    beam = (1.0 - float(np.median(narrow)) ** 2) / (t * m + m * m)  # of the line's variance
+    return float(np.nanmedian(whole)) * float(np.sqrt(beam)) * m if beam < 1.0 else float("inf")
 
 
 def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Beside) -> tuple[float, F64]:
@@ -158,15 +162,18 @@ def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Bes
     points = points[np.isfinite(points[:, 0])]
     if len(points) < 2 * _FEWEST:
         return float("nan"), slope
-    middle = points.mean(axis=0)
-    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    for _ in range(_FITS):  # without what does not belong to it
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+        rest = np.abs((points - middle) @ normal)
+        points = points[rest <= _FAR_OFF * np.median(rest)]
     per_column = slope @ scan.mount.T_world_head(float(scan.bearings[k]))[:3, :3].T @ normal
 
     def off(one: int) -> F64:
         return np.asarray((scan.points[one, rows] - middle) @ normal / per_column, np.float64)
 
     moved = float(np.nanmedian(off(k)))
-    flat = np.median(np.abs((points - middle) @ normal)) < _FLAT_PX * np.nanmedian(np.abs(per_column))
+    flat = np.median(rest) < _FLAT_PX * np.nanmedian(np.abs(per_column))
     if not flat or not _edge(scan, k, rows, beside, moved * _toward(scan, pipeline, k, rows, beside.near), off):
         moved = float("nan")
     return moved, slope
@@ -184,8 +191,9 @@ def _edge(scan: Scan, k: int, rows: Index, beside: _Beside, away: float, off: Ca
         range_m = scan.range_m[beside.other, rows]
         jumps = np.abs(range_m / scan.range_m[k, rows] - 1.0) > _OTHER
         goes_on = np.abs(off(beside.other)) < 2.0 * abs(away)
-    told = np.mean(jumps | goes_on | ~np.isfinite(range_m)) > 0.5
-    return bool(told and (away > 0 or (np.mean(goes_on) > 0.5 and len(rows) >= 3 * _LONG)))
+    here = ~jumps & np.isfinite(range_m)
+    behind = np.count_nonzero(here) >= 3 * _LONG and goes_on[here].mean() > 0.5
+    return bool((goes_on | ~here).mean() > 0.5 and (away > 0 or behind))
 
 
 def _toward(scan: Scan, pipeline: Pipeline, k: int, rows: Index, near: int) -> float:
