@@ -182,7 +182,7 @@ def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Bes
 def _edge(scan: Scan, k: int, rows: Index, beside: _Beside, away: float, off: Callable[[int], F64]) -> bool:
     """Whether what lies on the other side lets a line be cut there and move `away` from it [px], rather than bend.
 
-    Either it lies before the surface, or behind; or the surface goes on, behind something thin on either side, which
+    Either it lies before the surface, or behind; or the plane goes on, behind something thin on either side, which
     more rows must tell.
     """
     if beside.other is None:
@@ -190,7 +190,7 @@ def _edge(scan: Scan, k: int, rows: Index, beside: _Beside, away: float, off: Ca
     with np.errstate(invalid="ignore"):
         range_m = scan.range_m[beside.other, rows]
         jumps = np.abs(range_m / scan.range_m[k, rows] - 1.0) > _OTHER
-        goes_on = np.abs(off(beside.other)) < 2.0 * abs(away)
+        goes_on = np.abs(off(beside.other)) < 0.5 * abs(away)
     here = ~jumps & np.isfinite(range_m)
     behind = np.count_nonzero(here) >= 3 * _LONG and goes_on[here].mean() > 0.5
     return bool((goes_on | ~here).mean() > 0.5 and (away > 0 or behind))
