@@ -103,7 +103,8 @@ def colour_doubt(image: U8, channel: int, candidates: Candidates, noise: float, 
     broad = np.flatnonzero(near_by.own < _BROAD * response)
     if image.shape[1] <= (2 * HALF + 1) * _COARSE:
         broad = broad[:0]
-    coarse = _colours(image, block[broad], column[broad], channel, _COARSE)
+    # A picture narrower than that scale has no profile to take there, not even of no candidate.
+    coarse = _colours(image, block[broad], column[broad], channel, _COARSE if broad.size else 1)
     share = np.full(candidates.snr.shape, np.nan, np.float32)
     # Clipped, a line's own height is too small and its share too large: still a bound for the laser's.
     share[:, 0] = shares
