@@ -7,6 +7,10 @@ under that very soname. Loaded into the process first, the dynamic linker finds 
 from __future__ import annotations
 
 import ctypes
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -17,6 +21,8 @@ from scanmap.errors import ConfigError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+_STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @cache
@@ -33,10 +39,31 @@ def load_open3d() -> Any:
     except (ImportError, OSError):
         pass  # a system with its own libusb, or none needed; open3d's import decides
     try:
-        import open3d
+        with _signals_wait():
+            import open3d
     except (ImportError, OSError) as error:
         raise ConfigError(f"open3d cannot be loaded ({error}); try `pip install open3d libusb-package`") from error
     return open3d
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Hold back what would stop this process, for the fraction of a second that a native library takes to load.
+
+    open3d that is half loaded counts its memory as leaked, and ends the process with a page of it and exit code 1.
+    """
+    came: list[int] = []
+    before = {}
+    if threading.current_thread() is threading.main_thread():  # no other may, and none is interrupted
+        # Blocked in this thread they would come to another, and interrupt this one all the same.
+        before = {number: signal.signal(number, lambda number, frame: came.append(number)) for number in _STOPPING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
 
 
 class Hits(NamedTuple):

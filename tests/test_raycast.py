@@ -1,12 +1,16 @@
 """Ray casting: hits, occlusion and distances against formulas."""
 
+import signal
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanmap.errors import ConfigError
-from scanmap.raycast import RayScene
+from scanmap.raycast import RayScene, load_open3d
 from scanmap.twin.mesh import box, quad
 
 ROOM = (4.0, 3.0, 2.5)
@@ -86,3 +90,17 @@ def test_distance_to_the_surface(room: RayScene) -> None:
 def test_a_mesh_without_triangles_is_refused() -> None:
     with pytest.raises(ConfigError, match="no triangles"):
         RayScene(np.zeros((5, 3)), np.zeros((0, 3)))
+
+
+def test_interrupt_waits_until_the_library_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "open3d.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\nwhole = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            load_open3d.__wrapped__()
+        assert sys.modules["open3d"].whole
+    finally:
+        signal.signal(signal.SIGINT, before)
+        sys.modules.pop("open3d", None)
