@@ -1,5 +1,6 @@
 """The loop: order, memory, faults, and what comes through when the source breaks."""
 
+import errno
 import os
 import pickle
 import signal
@@ -303,7 +304,9 @@ def test_source_that_fails_and_stop_end_the_worker_processes_run_too(processes: 
     assert processes.run(shots(300), [steps.append], stop=lambda: len(steps) >= 8) < 200
 
 
-def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
+def test_killed_worker_process_costs_no_shot_and_is_told_once(
+    pipeline: Pipeline, caplog: pytest.LogCaptureFixture
+) -> None:
     steps: list[Step] = []
     with Processes(pipeline, count=2) as workers:
 
@@ -312,9 +315,24 @@ def test_killed_worker_process_costs_no_shot(pipeline: Pipeline) -> None:
             if len(steps) == 3:
                 os.kill(workers.pids[0], signal.SIGKILL)
 
-        workers.run(shots(12), [sink])
-    assert [step.shot.index for step in steps] == list(range(12))
+        workers.run(shots(60), [sink])
+    assert len([line for line in caplog.messages if "ended" in line]) == 1
+    assert [step.shot.index for step in steps] == list(range(60))
     assert all((step.line.reason == Reason.OK).mean() > 0.99 for step in steps)
+
+
+def test_system_without_room_for_a_worker_process_costs_no_shot(
+    pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("scanmap.pipeline.processes.start", full)
+    steps: list[Step] = []
+    with Processes(pipeline, count=2) as workers:
+        workers.run(shots(5), [steps.append])
+    assert [step.shot.index for step in steps] == list(range(5))
+    assert caplog.messages == ["0 of 2 worker processes were started: Resource temporarily unavailable"]
 
 
 _BITS = """

@@ -72,9 +72,11 @@ class Processes:
         self.pipeline = pipeline
         cores = os.cpu_count() or 1
         helps = not count and 1 < cores <= _HELPS_CORES
-        self._workers = [_Worker(pipeline) for _ in range(count or cores - helps)]
+        self._workers = _started(pipeline, count or cores - helps)
+        helps = helps or not self._workers
         self.threads = IN_FLIGHT * len(self._workers) + helps
         self._free: queue.SimpleQueue[_Worker | None] = queue.SimpleQueue()  # None: this process itself
+        self._gone: set[_Worker | None] = set()
         if helps:
             keep_memory()
             self._free.put(None)
@@ -110,11 +112,24 @@ class Processes:
         try:
             answers = worker.ask(shots, self.pipeline.laser) if worker else _answers(self.pipeline, shots)
         except (OSError, EOFError, pickle.UnpicklingError, ValueError) as gone:
-            log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
+            if worker not in self._gone:
+                self._gone.add(worker)
+                log.warning("a worker process ended (%s); its shots are processed here", gone or "its pipe closed")
             return iter([self.pipeline.process(shot) for shot in shots])
         finally:
             self._free.put(worker)
         return _steps(shots, answers)
+
+
+def _started(pipeline: Pipeline, count: int) -> list[_Worker]:
+    """Workers, as many of them as the system has room for."""
+    workers: list[_Worker] = []
+    try:
+        while len(workers) < count:
+            workers.append(_Worker(pipeline))
+    except OSError as error:
+        log.warning("%d of %d worker processes were started: %s", len(workers), count, error.strerror or error)
+    return workers
 
 
 def _steps(shots: list[Shot], answers: list[Answer]) -> Iterator[Step]:
