@@ -380,6 +380,24 @@ def test_no_line_at_all_overwrites_nothing(run: Run, frames: Path, tmp_path: Pat
     one_line(run("map", frames, "--out", "m.yaml"), 1, "no cloud or map")
 
 
+def test_replay_that_broke_off_overwrites_nothing(
+    run: Run, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("replay", small, "--out", "o.ply", "--map", "m.yaml")
+    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm"):
+        (tmp_path / name).write_text("yesterday's")
+    monkeypatch.setattr(terminal.Stop, "orderly", lambda stop, words: lambda: True)
+    said = run(*asked)
+    assert said.code == 130 and "wrote unfinished-2-o.ply" in said.out and "next: scanmap info unf" in said.out, said
+    assert "wrote unfinished-1-m.yaml" in said.out and "wrote unfinished-1-m.pgm" in said.out
+    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm"):
+        assert (tmp_path / name).read_text() == "yesterday's"
+    assert run("info", "unfinished-1-m.yaml").code == 0
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    assert run(*asked).code == 0 and (tmp_path / "o.ply").read_bytes() == small.with_suffix(".ply").read_bytes()
+
+
 def edit(name: str, old: str, new: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).write_text((folder / name).read_text().replace(old, new)) and None  # type: ignore[func-returns-value]
 

@@ -236,7 +236,7 @@ class Job:
         if summary.points:
             with ThreadPoolExecutor(1) as beside:
                 drawn = beside.submit(OccupancyGrid.from_scan, clean, self.config.grid)
-                files, unwritten = write_results(clean, drawn.result, self.outputs, self.config.scan)
+                files, unwritten = write_results(clean, drawn.result, self.outputs.after(ended), self.config.scan)
             grid = drawn.result()
         else:
             error = error or RecordingError(self._pointless(summary))
@@ -301,8 +301,8 @@ class Job:
             cloud = "".join(f" --out {shlex.quote(str(file))}" for file in self.outputs.clouds[:1])
             go_on = [f"scanmap scan --resume {path}{cloud}"] if ended != "finished" else []
             return [*go_on, f"scanmap view {look}", f"scanmap info {path}", f"scanmap replay {path} --out other.ply"]
-        clouds = [shlex.quote(str(path)) for path in files if path in self.outputs.clouds and is_scan_file(path)]
-        maps = [shlex.quote(str(path)) for path in files if path == self.outputs.map]
+        clouds = [shlex.quote(str(path)) for path in files if is_scan_file(path)]
+        maps = [shlex.quote(str(path)) for path in files if path.suffix == ".yaml"]
         commands = [f"scanmap info {path}" for path in (*clouds[:1], *maps)]
         return commands if maps else [*commands, *(f"scanmap map {cloud} --out map.yaml" for cloud in clouds[:1])]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -47,6 +47,13 @@ class Outputs:
         if map_ is None and clouds:
             map_ = first.with_name(f"{first.stem}.yaml")
         return cls(clouds, map_, record, rrd)
+
+    def after(self, ended: str) -> Outputs:
+        """Where results go: those of a scan that broke off stand beside what has their names, which may be whole."""
+        if ended == "finished":
+            return self
+        map_ = _free(self.map, f".{self.map_image}") if self.map is not None else None
+        return replace(self, clouds=tuple(_free(path) for path in self.clouds), map=map_)
 
     def check(self) -> None:
         """Raise ConfigError unless every file can be written; before a scan is wasted on it."""
@@ -115,3 +122,12 @@ def write_results(
         map_path = outputs.map
         attempt(map_path, lambda: save_map(grid(), map_path, image_format=outputs.map_image, mode=outputs.map_mode))
     return written, failed
+
+
+def _free(path: Path, *others: str) -> Path:
+    """The path, or `unfinished-1-room.ply` where it exists, or one of the same name with another suffix does."""
+    free, number = path, 0
+    while any(free.with_suffix(suffix).exists() for suffix in (path.suffix, *others)):
+        number += 1
+        free = path.with_name(f"unfinished-{number}-{path.name}")
+    return free
