@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from scanmap.calibration import Calibration, Intrinsics, PixelAngleModel, RatioModel
@@ -246,7 +246,7 @@ def test_another_resolution_keeps_the_rays(calibration, scale, x, y):
     new = scaled.intrinsics
     before = np.array([x * old.width - 0.5]), np.array([y * old.height - 0.5])
     after = np.array([x * new.width - 0.5]), np.array([y * new.height - 0.5])
-    # Beyond where a lens folds over, rounding decides whether a ray is found.
+    # Where a lens folds over, rounding decides whether a ray is found.
     assume(opens(old, np.concatenate([new.rays(*after), old.rays(*before)])))
     np.testing.assert_allclose(new.rays(*after), old.rays(*before), atol=1e-6)
     if calibration.pixel_angle is not None:
@@ -271,6 +271,18 @@ def test_rays_and_pixels_are_inverse_and_the_lens_is_opencvs(distortion, seed):
     np.testing.assert_allclose(camera.rays(pixels[..., 0], pixels[..., 1]), rays, atol=1e-8)
     by_opencv = cv2.projectPoints(rays.reshape(-1, 3), np.zeros(3), np.zeros(3), camera.matrix, np.array(distortion))[0]
     np.testing.assert_allclose(camera.project(rays).reshape(-1, 2), by_opencv[:, 0], atol=1e-7)
+
+
+@given(distortion=lens, away=st.floats(0.0, 2.0), turn=st.floats(0.0, 2.0 * np.pi))
+@settings(max_examples=200, deadline=None)
+@example(distortion=(0.0, 0.09375, 0.0, 0.0, 0.01171875), away=1.2, turn=3.0)  # OpenCV's steps do not get there
+@example(distortion=(0.0266, 0.0542, 0.0004, 0.0013, -0.0116), away=1.95, turn=1.0)  # and here get to beyond the fold
+def test_wherever_a_lens_opens_its_rays_are_found(distortion, away, turn):
+    camera = Intrinsics(1600, 1200, 1265.0, 1270.0, 790.0, 610.0, distortion)
+    ray = np.array([[away * np.cos(turn), away * np.sin(turn), 1.0]])
+    assume(opens(camera, ray))
+    pixel = camera.project(ray)
+    np.testing.assert_allclose(camera.rays(pixel[:, 0], pixel[:, 1]), ray, atol=1e-6)
 
 
 def test_a_pixel_that_no_ray_reaches_has_none():
