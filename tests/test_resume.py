@@ -15,6 +15,7 @@ from scanmap.errors import ConfigError, ScanmapError, StageError
 from scanmap.recording import RecordingParams, describe, open_source
 from scanmap.session import preparing
 from scanmap.session.rigs import OpenRig, open_rig
+from scanmap.sweep import plan
 
 pytestmark = pytest.mark.usefixtures("baked_once")
 
@@ -197,10 +198,14 @@ def test_a_continuous_sweep_goes_on_where_it_was_left(tmp_path: Path) -> None:
     job = resume(first)
     assert any("was recognised" in line for line in job.announcement)
     source = open_source(first)
-    ours, theirs = list(source.shots()), list(open_source(whole).shots())
-    assert [shot.index for shot in ours] == [shot.index for shot in theirs] and len(there) < len(ours)
-    for shot, clean in zip(ours, theirs, strict=True):
-        assert abs(shot.bearing - clean.bearing) < math.radians(0.2 + 0.02)  # a picture later, a little off
+    ours, theirs = ({shot.index: shot.bearing for shot in of.shots()} for of in (source, open_source(whole)))
+    assert len(there) < len(ours) == describe(first).shots
+    slots = len(plan(job.config.sweep, job.config.stage.limits).bearings) // 2
+    # Whether a picture falls into the slots where the head speeds up and slows down, chance decides.
+    assert {index % slots for index in ours.keys() ^ theirs.keys()} <= {0, slots - 1}
+    assert len(ours.keys() & theirs.keys()) >= 2 * slots - 4
+    for index in ours.keys() & theirs.keys():
+        assert abs(ours[index] - theirs[index]) < math.radians(0.2 + 0.02)  # a picture later, a little off
     with pytest.raises(ConfigError, match="is complete"):
         resume(first)
 
