@@ -128,6 +128,28 @@ def test_a_cut_core_in_a_grey_jpeg_is_told_by_its_flanks_alone() -> None:
         assert 0.8 < np.sqrt(np.mean(scaled**2)) < 1.15
 
 
+@pytest.mark.parametrize(
+    ("subsampling", "lean", "limit"),
+    # Limits: RMS pooled [px]; by the laser's channel alone, uncut as it seems, 0.069, 0.050 and 0.053.
+    [("420", 0.0, 0.025), ("420", 0.3, 0.022), ("444", 0.02, 0.02)],
+)
+def test_less_a_laser_off_frame_saturated_lines_are_placed_by_brightness_too(subsampling, lean, limit) -> None:
+    off, scaled = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        column = 180.0 + rng.uniform(0.0, 8.0) + lean * (np.arange(480) - 240.0)
+        room = 40.0 + 6.0 * cv2.GaussianBlur(rng.standard_normal((480, 400)), (0, 0), 25.0)[..., None] * 40.0
+        bell = np.exp(-0.5 * ((np.arange(400.0) - column[:, None]) / 2.0) ** 2)[..., None]
+        pictures = [room + part * bell * np.array(RED) + 2.5 * rng.standard_normal((480, 400, 3)) for part in (500, 0)]
+        on, dark = (compressed(np.clip(np.rint(p), 0, 255).astype(np.uint8), 90, subsampling) for p in pictures)
+        line = find_laser_line(on, POOLED, dark)
+        off.append(line.column_px - column)
+        scaled.append(off[-1] / line.sigma_px)
+    assert np.isfinite(off).mean() > 0.99
+    assert np.sqrt(np.nanmean(np.square(off))) < limit
+    assert np.nanstd(scaled) < 1.15
+
+
 @pytest.mark.parametrize("laser", [RED, GREEN], ids=["red", "green"])
 def test_smeared_colour_beside_a_cut_core_is_no_halo(laser) -> None:
     """What smeared colour leaves of the flanks is no Gaussian; in brightness they are. As a halo's core: 0.1 px off."""

@@ -36,8 +36,7 @@ def by_brightness(
     """
     smeared = around.smeared[some]
     again = not_one(np.flatnonzero(peaks.clipped & good & smeared & (peaks.width_px < _BAR_PX)))
-    # Less a laser-off frame, it is cut at another level in each column.
-    if around.beside is None or around.lit is not around.seen or not again.size:
+    if around.beside is None or not again.size:
         return peaks
     rows = again if isinstance(some, slice) else some[again]
     own = around.rows.of(rows)

@@ -240,7 +240,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         noise = rows.noise
         y, usable = around.of(half, some)
         sides = sides_of(y, rows)
-        limit = around.limit_of(usable)
+        limit = around.limit_of(usable, some)
         peaks = fit_gaussian(y, usable, rows, contrasts, partial(around.of, some=some), limit)
         contrasts = peaks.contrast
         reason = judged(peaks, noise, params)

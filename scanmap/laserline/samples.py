@@ -32,6 +32,7 @@ class Samples(NamedTuple):
     lit: U8  # of the laser's light
     seen: U8  # of the picture, which says where it saturates
     beside: U8 | None  # of the neighbouring channel; None where it nowhere knows more of the place
+    seen_beside: U8 | None  # of that channel in the picture, which says where it saturates
     outside: NDArray[np.bool_] | None  # beside the picture; None when nothing is
     rows: Rows  # which pictures they are of
     channel: int  # of the laser, where `beside` is known
@@ -49,15 +50,24 @@ class Samples(NamedTuple):
             usable &= ~_some(self.outside[span], some)
         return y, usable.astype(np.float32)
 
-    def limit_of(self, usable: F32) -> F32:
-        """At what grey level (n,) the lines are cut whose `usable` samples (2 half + 1, n) these are; infinite: not.
+    def limit_of(self, usable: F32, some: Index | slice) -> F32:
+        """At what grey level (n,) the lines of some rows are cut; infinite: not.
 
         Of a top that was cut a JPEG makes samples above and below the level: where the line itself is higher, none
-        says more than "bright". With a laser-off frame the level is another one in each column, and not told.
+        says more than "bright".
+
+        Args:
+            usable: (2 half + 1, n) as `of` has it.
+            some: the rows.
         """
-        middle = len(usable) // 2
-        cut = (usable[middle - 1 : middle + 2].min(axis=0) < 1) & (self.lit is self.seen)
-        return np.where(cut, np.float32(SATURATED), np.float32(np.inf))
+        half = len(usable) // 2
+        limit = np.full(usable.shape[1], np.inf, np.float32)
+        cut = np.flatnonzero(usable[half - 1 : half + 2].min(axis=0) < 1)
+        if cut.size:
+            span = slice(REACH - half, REACH + half + 1)
+            rows = cut if isinstance(some, slice) else some[cut]
+            limit[cut] = self._cut_at(_some(self.seen[span], rows), _some(self.lit[span], rows))
+        return limit
 
     def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32, F32, F32]:
         """The same in what JPEG stores as brightness, where (n,) the laser's channel is cut in it, and its share (n,).
@@ -69,22 +79,31 @@ class Samples(NamedTuple):
         other channels in it do not saturate; a top cut flat is as even on both sides as a whole one.
         """
         span = slice(REACH - half, REACH + half + 1)
-        assert self.beside is not None
-        own, beside = _some(self.lit[span], some), _some(self.beside[span], some)
-        usable = beside < SATURATED
+        assert self.beside is not None and self.seen_beside is not None
+        own, beside, seen = (_some(channel[span], some) for channel in (self.lit, self.beside, self.seen))
+        usable = _some(self.seen_beside[span], some) < SATURATED
         if self.outside is not None:
             usable &= ~_some(self.outside[span], some)
         share = np.float32(BRIGHTNESS[self.channel])
         brightness: F32 = own * share
         brightness += beside * (np.float32(1.0) - share)
         # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut.
+        flank = seen < SATURATED
+        level = self._cut_at(seen, own)
         own, beside = own.astype(np.float32), beside.astype(np.float32)
         low, low_beside = (np.float32(0.5) * np.add(*ends(channel)) for channel in (own, beside))
-        flank = own < SATURATED
         light = np.maximum((flank * (own - low)).sum(axis=0), np.float32(1.0))
-        seen = (flank * (beside - low_beside)).sum(axis=0) / light
-        cut = share * SATURATED + (np.float32(1.0) - share) * (low_beside + seen * (SATURATED - low))
-        return brightness, usable.astype(np.float32), cut, share + (np.float32(1.0) - share) * seen
+        as_much = (flank * (beside - low_beside)).sum(axis=0) / light
+        cut = share * level + (np.float32(1.0) - share) * (low_beside + as_much * (level - low))
+        return brightness, usable.astype(np.float32), cut, share + (np.float32(1.0) - share) * as_much
+
+    def _cut_at(self, seen: U8, own: U8) -> F32 | np.float32:
+        """Grey level (n,) that the laser's channel (m, n) is cut at: less what was taken away there, at most."""
+        if self.lit is self.seen:
+            return np.float32(SATURATED)
+        room = np.where(seen < SATURATED, seen.astype(np.int16) - own, np.int16(-255)).max(axis=0)
+        limit: F32 = np.float32(SATURATED) - room
+        return limit
 
 
 def _some(values: NDArray[Any], some: Index | slice) -> NDArray[Any]:
@@ -95,21 +114,25 @@ def _some(values: NDArray[Any], some: Index | slice) -> NDArray[Any]:
 def samples_of(sight: Sight, row: Index, column: Index) -> Samples:
     """The samples around integer columns (N,) of rows (N,)."""
     lit, seen = sight.lit, sight.plane
-    beside = outside = None
+    beside = seen_beside = outside = None
     smeared = np.array([mixture.channel >= 0 for mixture in sight.mixtures])
     if sight.image is not None and smeared.any():
         across = strips(sight.image, row, column, REACH)
         y, beside = across[:, sight.channel], across[:, NEIGHBOUR[sight.channel]]
+        seen_beside = beside
     else:
         y = strips(lit, row, column, REACH)
-        beside = None if sight.beside is None else strips(sight.beside, row, column, REACH)
+        beside, seen_beside = (
+            None if plane is None else strips(plane, row, column, REACH) for plane in (sight.beside, sight.on_beside)
+        )
     bright = y if seen is lit else strips(seen, row, column, REACH)
     if column.min() < REACH or column.max() >= lit.shape[1] - REACH:
         x = column + np.arange(-REACH, REACH + 1)[:, None]
         outside = (x < 0) | (x >= lit.shape[1])
     share = np.array([mixture.share for mixture in sight.mixtures], np.float32)
     rows = Rows(row // sight.height, sight.noise)
-    return Samples(y, bright, beside, outside, rows, sight.channel, smeared[rows.picture], share[rows.picture])
+    own = smeared[rows.picture]
+    return Samples(y, bright, beside, seen_beside, outside, rows, sight.channel, own, share[rows.picture])
 
 
 def _mixed(own: F32, beside: U8, usable: NDArray[np.bool_], share: F32) -> F32:

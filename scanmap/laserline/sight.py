@@ -68,6 +68,7 @@ class Sight(NamedTuple):
     gain: float = 1.0  # that the laser-off frame's exposure is matched by
     # (H, W) what the laser added in the neighbouring channel, where that knows more of the place
     beside: U8 | None = None
+    on_beside: U8 | None = None  # (H, W) that channel as the camera saw it
 
     @property
     def large(self) -> bool:
@@ -126,7 +127,7 @@ def sight_of(
         mixtures = [_mixture(image[k : k + height], channel, own, rounding, noises) for k, own, rounding in each]
         return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
-    off, beside, gain = None, None, 1.0
+    off, beside, on_beside, gain = None, None, None, 1.0
     if background is not None:
         off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
         lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
@@ -139,7 +140,7 @@ def sight_of(
             on_beside, off_beside = (extract(picture, NEIGHBOUR[channel]) for picture in (image, background))
             off_beside, gain_beside = at_exposure(on_beside, off_beside)
             beside, mixtures = without_background(on_beside, off_beside, gain=gain_beside), [mixture]
-    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain, beside)
+    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain, beside, on_beside)
 
 
 def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
