@@ -16,6 +16,7 @@ Index = NDArray[np.intp]
 
 # Brightness places a saturated core at most this far [px] from where its flanks do, and not much less surely.
 _SAME_PX, _NO_WORSE = 1.0, 2.0
+_NOISES = 2.0  # that a sample may lie above where the core is cut
 _BAR_PX = 7.0  # wider, it is a bar, whose edges tell more
 _MISFIT = 0.05  # share of a line's height that compression and texture leave of it
 
@@ -42,6 +43,8 @@ def by_brightness(
     own = around.rows.of(rows)
     wide = min(half + half // 2, REACH)
     y, usable, cut, share = around.brightness_of(wide, rows)
+    # What is brighter than that is of the cut core, whatever a fit that it has moved makes of it.
+    usable *= y < cut + np.float32(_NOISES) * own.noise
     span = slice(wide - half, wide + half + 1)
     y = without_ramp(y, (np.arange(len(y), dtype=np.float32) - wide)[:, None], _ramp(y, y[span], own))[span]
     level = np.minimum(*ends(y))

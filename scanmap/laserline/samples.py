@@ -87,13 +87,17 @@ class Samples(NamedTuple):
         share = np.float32(BRIGHTNESS[self.channel])
         brightness: F32 = own * share
         brightness += beside * (np.float32(1.0) - share)
-        # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut.
-        flank = seen < SATURATED
         level = self._cut_at(seen, own)
         own, beside = own.astype(np.float32), beside.astype(np.float32)
         low, low_beside = (np.float32(0.5) * np.add(*ends(channel)) for channel in (own, beside))
-        light = np.maximum((flank * (own - low)).sum(axis=0), np.float32(1.0))
-        as_much = (flank * (beside - low_beside)).sum(axis=0) / light
+        # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut. The cut core
+        # lacks colour: smeared, the neighbour sees too much of the flanks near it, and too little of them far away.
+        light, light_beside, flank = own - low, beside - low_beside, seen < SATURATED
+        near, far = (
+            (part * light_beside).sum(axis=0) / np.maximum((part * light).sum(axis=0), np.float32(1.0))
+            for part in (flank, flank & (light < np.float32(0.5) * (level - low)))
+        )
+        as_much = np.float32(0.5) * (near + np.minimum(np.maximum(far, np.float32(0.0)), near))
         cut = share * level + (np.float32(1.0) - share) * (low_beside + as_much * (level - low))
         return brightness, usable.astype(np.float32), cut, share + (np.float32(1.0) - share) * as_much
 
