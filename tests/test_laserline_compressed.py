@@ -128,7 +128,7 @@ def test_a_cut_core_in_a_grey_jpeg_is_told_by_its_flanks_alone() -> None:
         assert 0.8 < np.sqrt(np.mean(scaled**2)) < 1.15
 
 
-@pytest.mark.parametrize(("sigma", "limit"), [(1.2, 0.025), (2.0, 0.02)])  # RMS pooled [px]; before, 0.054 and 0.034
+@pytest.mark.parametrize(("sigma", "limit"), [(1.2, 0.035), (2.0, 0.02)])  # RMS pooled [px]; before, 0.054 and 0.034
 def test_lines_cut_four_times_over_are_placed_where_the_cut_is_told(sigma: float, limit: float) -> None:
     """The cut core lacks colour, which smeared makes the other channels see too much of its flanks."""
     off, scaled = [], []

@@ -42,7 +42,7 @@ def by_brightness(
     rows = again if isinstance(some, slice) else some[again]
     own = around.rows.of(rows)
     wide = min(half + half // 2, REACH)
-    y, usable, cut, share = around.brightness_of(wide, rows)
+    y, usable, cut, share = around.brightness_of(wide, rows, peaks.height[again])
     # What is brighter than that is of the cut core, whatever a fit that it has moved makes of it.
     usable *= y < cut + np.float32(_NOISES) * own.noise
     span = slice(wide - half, wide + half + 1)

@@ -23,6 +23,9 @@ REACH = 24  # [px] samples on either side of the column
 # Half of the fit's window, and the largest full width at half height it is for.
 _WINDOWS = ((8, 6), (13, 11), (REACH, 200))
 
+# How much more the far flanks count of a core that is cut off by a share of its height, up to half.
+_LACKS = 1.3
+
 _FEW, _STRAY = 24, 0.006  # rows, and a share of all rows
 
 
@@ -69,10 +72,10 @@ class Samples(NamedTuple):
             limit[cut] = self._cut_at(_some(self.seen[span], rows), _some(self.lit[span], rows))
         return limit
 
-    def brightness_of(self, half: int, some: Index | slice) -> tuple[F32, F32, F32, F32]:
+    def brightness_of(self, half: int, some: Index | slice, height: F32) -> tuple[F32, F32, F32, F32]:
         """The same in what JPEG stores as brightness, where (n,) the laser's channel is cut in it, and its share (n,).
 
-        Only where `beside` is known.
+        Only where `beside` is known. What the rows' lines would rise to is their `height` (n,) [grey levels].
 
         Where the laser's channel saturates, colour, smeared over two columns and more, moves what is decoded of its
         flanks by up to a tenth of a pixel, in all rows of an upright line alike. Brightness is not smeared, and the
@@ -91,13 +94,16 @@ class Samples(NamedTuple):
         own, beside = own.astype(np.float32), beside.astype(np.float32)
         low, low_beside = (np.float32(0.5) * np.add(*ends(channel)) for channel in (own, beside))
         # What the neighbour sees of the flanks, it sees as much more where the laser's channel is cut. The cut core
-        # lacks colour: smeared, the neighbour sees too much of the flanks near it, and too little of them far away.
+        # lacks colour, the more the higher it is cut off: smeared, that makes the neighbour see too much of the
+        # flanks near it, and too little of them far away.
         light, light_beside, flank = own - low, beside - low_beside, seen < SATURATED
         near, far = (
             (part * light_beside).sum(axis=0) / np.maximum((part * light).sum(axis=0), np.float32(1.0))
             for part in (flank, flank & (light < np.float32(0.5) * (level - low)))
         )
-        as_much = np.float32(0.5) * (near + np.minimum(np.maximum(far, np.float32(0.0)), near))
+        far = np.minimum(np.maximum(far, np.float32(0.0)), near)
+        lacks = np.maximum(np.float32(1.0) - (level - low) / height, np.float32(0.0))
+        as_much = near + np.minimum(np.float32(_LACKS) * lacks, np.float32(0.5)) * (far - near)
         cut = share * level + (np.float32(1.0) - share) * (low_beside + as_much * (level - low))
         return brightness, usable.astype(np.float32), cut, share + (np.float32(1.0) - share) * as_much
 
