@@ -24,6 +24,7 @@ from scanmap.cli import main, terminal
 from scanmap.config import load, parse
 from scanmap.recording import open_source
 from scanmap.session.job import Job
+from scanmap.view.recorder import is_whole
 
 QUICK = (
     "--config", "twin-quick", "--set", "calibration.image.width=320", "--set", "calibration.image.height=240",
@@ -383,19 +384,40 @@ def test_no_line_at_all_overwrites_nothing(run: Run, frames: Path, tmp_path: Pat
 def test_replay_that_broke_off_overwrites_nothing(
     run: Run, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = ("replay", small, "--out", "o.ply", "--map", "m.yaml")
-    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm"):
+    asked = ("replay", small, "--out", "o.ply", "--map", "m.yaml", "--rrd", "v.rrd")
+    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm", "v.rrd"):
         (tmp_path / name).write_text("yesterday's")
     monkeypatch.setattr(terminal.Stop, "orderly", lambda stop, words: lambda: True)
     said = run(*asked)
     assert said.code == 130 and "wrote unfinished-2-o.ply" in said.out and "next: scanmap info unf" in said.out, said
-    assert "wrote unfinished-1-m.yaml" in said.out and "wrote unfinished-1-m.pgm" in said.out
-    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm"):
+    for name in ("m.yaml", "m.pgm", "v.rrd"):
+        assert f"wrote unfinished-1-{name}" in said.out
+    assert is_whole(tmp_path / "unfinished-1-v.rrd")
+    for name in ("o.ply", "unfinished-1-o.ply", "m.pgm", "v.rrd"):
         assert (tmp_path / name).read_text() == "yesterday's"
     assert run("info", "unfinished-1-m.yaml").code == 0
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    assert run(*asked).code == 0 and (tmp_path / "o.ply").read_bytes() == small.with_suffix(".ply").read_bytes()
+    said = run(*asked)
+    assert said.code == 0 and (tmp_path / "o.ply").read_bytes() == small.with_suffix(".ply").read_bytes()
+    assert "wrote v.rrd" in said.out and is_whole(tmp_path / "v.rrd")
+    assert not (tmp_path / "unfinished-2-v.rrd").exists()
+
+
+def test_a_replay_without_a_shot_leaves_an_older_view(run: Run, frames: Path, tmp_path: Path) -> None:
+    (tmp_path / "v.rrd").write_text("yesterday's")
+    for picture in (frames / "frames").iterdir():
+        picture.unlink()
+    one_line(run("replay", frames, "--out", "o.ply", "--rrd", "v.rrd"), 1, "none of the 7 images")
+    assert (tmp_path / "v.rrd").read_text() == "yesterday's" and not list(tmp_path.glob("unfinished*"))
+
+
+def test_pictures_too_narrow_for_a_line_are_refused_in_one_line(run: Run, frames: Path) -> None:
+    for picture in (frames / "frames").iterdir():
+        cv2.imwrite(str(picture), cv2.imread(str(picture))[:, 100:102])
+    edit("calibration.toml", "width = 320", "width = 2")(frames)
+    edit("calibration.toml", "cx = 159.5", "cx = 0.5")(frames)  # else nothing is in range there
+    one_line(run("replay", frames, "--out", "o.ply"), 1, "a picture of 2x240 px is too narrow", "6 columns or more")
 
 
 def edit(name: str, old: str, new: str) -> Callable[[Path], None]:

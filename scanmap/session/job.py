@@ -240,7 +240,7 @@ class Job:
             grid = drawn.result()
         else:
             error = error or RecordingError(self._pointless(summary))
-        self._close_view(clean, grid, files, unwritten)
+        self._close_view(clean, grid, ended, files, unwritten)
         if self.recorder is not None:
             files.append(self.recorder.path)
         return Result(
@@ -258,24 +258,24 @@ class Job:
         )
 
     def _close_view(
-        self, scan: Scan, grid: OccupancyGrid | None, files: list[Path], unwritten: list[tuple[Path, str]]
+        self, scan: Scan, grid: OccupancyGrid | None, ended: str, files: list[Path], unwritten: list[tuple[Path, str]]
     ) -> None:
         if self.view is None:
             return
         self.view.finish(scan, grid)
         self.view.close()
-        if self.outputs.rrd is not None and self.view.whole:
-            files.append(self.outputs.rrd)
-        elif self.outputs.rrd is not None:
-            self.outputs.rrd.unlink(missing_ok=True)  # without its end no viewer opens it
-            unwritten.append((self.outputs.rrd, "it could not be written to its end; is the disk full?"))
+        if (drawn := self.view.rrd) is not None and self.view.whole:
+            files.append(self.outputs.placed_rrd(drawn, ended))
+        elif drawn is not None:
+            drawn.unlink(missing_ok=True)  # without its end no viewer opens it
+            unwritten.append((drawn, "it could not be written to its end; is the disk full?"))
 
     def _leave_nothing_empty(self) -> None:
         """Close what is still open; a recording or view without a single shot is not worth a file."""
         if self.view is not None:
             self.view.close()
-            if not self.done and self.outputs.rrd is not None:
-                self.outputs.rrd.unlink(missing_ok=True)
+            if not self.done and self.view.rrd is not None:
+                self.view.rrd.unlink(missing_ok=True)
         if self.recorder is not None:
             self._close_recording("interrupted")
             if not self.recorder.shots:

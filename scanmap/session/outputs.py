@@ -55,6 +55,20 @@ class Outputs:
         map_ = _free(self.map, f".{self.map_image}") if self.map is not None else None
         return replace(self, clouds=tuple(_free(path) for path in self.clouds), map=map_)
 
+    @property
+    def rrd_drawn(self) -> Path | None:
+        """Where a view is written while the scan runs: beside an older one, which is whole."""
+        return _free(self.rrd) if self.rrd is not None else None
+
+    def placed_rrd(self, drawn: Path, ended: str) -> Path:
+        """Where the view that was `drawn` is in the end: only that of a finished scan replaces an older one."""
+        if ended != "finished" or self.rrd is None or drawn == self.rrd:
+            return drawn
+        try:
+            return drawn.replace(self.rrd)
+        except OSError:  # it is whole all the same, and named where it is
+            return drawn
+
     def check(self) -> None:
         """Raise ConfigError unless every file can be written; before a scan is wasted on it."""
         self.refuse_folders()

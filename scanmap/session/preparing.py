@@ -265,7 +265,7 @@ def _open_view(job: Job, *, title: str, is_twin: bool, live: bool) -> None:
         settings_toml=config.dumps(),
         title=title,
         is_twin=is_twin,
-        rrd=job.outputs.rrd,
+        rrd=job.outputs.rrd_drawn,
         live_port=config.view.live_port if live else None,
         laserline=config.laserline,
     )

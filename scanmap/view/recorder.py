@@ -76,7 +76,7 @@ class View:
         self._calibration = calibration
         self._params = params
         self._thesis = thesis
-        self._rrd = rrd
+        self.rrd = rrd  # the file, where there is one
         self._shrink = shrink_factor(calibration.intrinsics.width, params.image_width_px)
         self._complaints: set[str] = set()
         self._states: dict[str, str] = {}
@@ -163,9 +163,9 @@ class View:
             import rerun as rr
 
             rr.unregister_shutdown()  # it would wait for the same thing when the program ends
-        if closing.is_alive() or (self._rrd is not None and not is_whole(self._rrd)):
+        if closing.is_alive() or (self.rrd is not None and not is_whole(self.rrd)):
             self.whole = False
-            self.complain(f"{self._rrd} could not be written to its end; is the disk full?")
+            self.complain(f"{self.rrd} could not be written to its end; is the disk full?")
 
     def __enter__(self) -> View:
         return self
@@ -241,9 +241,9 @@ class View:
             self._recording.log(path, rr.StateChange(state=state))
 
     def _disk_has_room(self) -> bool:
-        if self._rrd is None or shutil.disk_usage(self._rrd.parent).free >= MIN_FREE_BYTES:
+        if self.rrd is None or shutil.disk_usage(self.rrd.parent).free >= MIN_FREE_BYTES:
             return True
-        self.complain(f"less than {MIN_FREE_BYTES // 1_000_000} MB free for {self._rrd}; the view ends here")
+        self.complain(f"less than {MIN_FREE_BYTES // 1_000_000} MB free for {self.rrd}; the view ends here")
         self.close()
         return False
 
