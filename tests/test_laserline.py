@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_lines import GREEN, HARD, RED, LineSpec, bound, clean, errors, hard_frame, line_light, score, sensor
 
+from scanmap.errors import CameraError
 from scanmap.laserline import LaserLineParams, Reason, find_laser_line
 from scanmap.laserline.channel import laser_channel
 
@@ -307,3 +308,22 @@ def test_white_between_red_stripes_is_no_green_laser():
     image[:, 104:300:12], image[:, 105:300:12] = (150, 155, 160), (150, 155, 160)
     red = line_light(np.full(240, 350.0), 60.0, 1.5, 400)[..., None] * np.float32(RED)
     assert laser_channel(sensor(image + red, 1.5, np.random.default_rng(0))) == 2
+
+
+# What is no picture of a line
+
+
+@pytest.mark.parametrize("shape", [(20, 1), (20, 4), (1000, 2), (20, 0), (20, 2, 3), (40, 5, 3)])
+def test_a_picture_too_narrow_for_a_line_is_refused_in_words(shape):
+    image = np.full(shape, 200, np.uint8)
+    if len(shape) == 3:  # a laser beyond doubt
+        image[:], image[:, shape[1] // 2] = (0, 0, 0), (10, 10, 255)
+    with pytest.raises(CameraError, match=f"picture of {shape[1]}x{shape[0]} px is too narrow: .* 6 columns or more"):
+        find_laser_line(image, GAUSS)
+
+
+def test_six_columns_are_enough_and_the_brightest_sample_needs_one():
+    image = np.zeros((20, 6, 3), np.uint8)
+    image[:, 2] = 200
+    assert len(find_laser_line(image, GAUSS).column_px) == 20
+    assert (find_laser_line(image[:, 2:3], LaserLineParams(method="brightest")).column_px == 0).all()

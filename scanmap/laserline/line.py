@@ -76,6 +76,9 @@ def find_laser_line(
 
     Returns:
         LaserLine of length H. A row that is not sure has NaN and a reason.
+
+    Raises:
+        CameraError: fewer than six columns, unless the brightest sample is all that is asked for.
     """
     return look(image, params, background, window, rounding=rounding).line
 

@@ -13,9 +13,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.errors import CameraError
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Index = NDArray[np.intp]
+U8 = NDArray[np.uint8]
+
+LEAST_WIDTH = 6  # columns: five for the narrowest matched filter, two groups of three for the noise in its band
 
 
 @dataclass(frozen=True)
@@ -53,3 +58,13 @@ def by_picture(picture: Index, count: int) -> list[slice]:
 def not_one(index: Index) -> Index:
     """The indices (N,), a single one twice: NumPy sums a single column by another rule than two or more."""
     return index.repeat(2) if len(index) == 1 else index
+
+
+def check_width(image: U8, height: int) -> None:
+    """Raise CameraError for pictures (P H, W, ...) of `height` rows too narrow to have a line and two sides."""
+    width = image.shape[1]
+    if width < LEAST_WIDTH:
+        raise CameraError(
+            f"a picture of {width}x{height} px is too narrow: line and what lies beside it need {LEAST_WIDTH} columns "
+            "or more; set another size in [camera], or give the pictures as the camera took them"
+        )

@@ -14,6 +14,7 @@ from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
 from scanmap.laserline.offmatch import at_exposure
+from scanmap.laserline.pictures import check_width
 from scanmap.laserline.rounding import Mixture, Rounding, best_mixture
 
 U8 = NDArray[np.uint8]
@@ -113,7 +114,11 @@ def sight_of(
         channel: as `channel_of` has it.
         roundings: (P,) of the files that the pictures were.
         noises: in that channel, where another picture has told them.
+
+    Raises:
+        CameraError: the pictures are too narrow for a line.
     """
+    check_width(image, height)
     if channel == ONE_FOR_ALL:
         channel, image, background = None, image[..., 1], None if background is None else background[..., 1]
     large = is_large(image[:height])
@@ -203,6 +208,7 @@ def noises_in_band(image: U8, channel: int) -> Noises:
     Compression takes the noise between one column and the next, which moves no line, and leaves more of that between
     groups of columns, which does.
     """
+    check_width(image, len(image))
     rows = np.ascontiguousarray(image[:: max(1, len(image) // 8)])
     means = cv2.resize(rows, (max(rows.shape[1] // _BAND_PX, 1), len(rows)), interpolation=cv2.INTER_AREA)
     own, other = (np.asarray(cv2.extractChannel(means, c), np.uint8) for c in (channel, NEIGHBOUR[channel]))
