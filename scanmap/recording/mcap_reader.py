@@ -124,7 +124,8 @@ def _data(found: Outline, assembler: Assembler, report: Report) -> Iterator[tupl
     """Every message of a file in its order, with its channel and the byte of its record; what is broken is reported."""
     path, directory, nameless = found.path, found.directory, 0
     with mcap_records.open_mcap(path) as file:
-        for record in mcap_records.walk(file):
+        # A recording that still grows is read as far every time: what is looked at again is what was seen.
+        for record in mcap_records.walk(file, found.size):
             if isinstance(record, Break):
                 report(_broken(path, record, assembler.done))
             elif record.opcode in mcap_records.DATA:

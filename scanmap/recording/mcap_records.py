@@ -111,13 +111,17 @@ def open_mcap(path: Path) -> BinaryIO:
     return file
 
 
-def walk(file: BinaryIO) -> Iterator[Record | Break]:
+def walk(file: BinaryIO, size: int | None = None) -> Iterator[Record | Break]:
     """Every record from the first to the footer, by seeking from one to the next.
+
+    Args:
+        size: [bytes] of the file as it was first seen, which may have grown since; as it is now if left out.
 
     `body` may be called between two steps. Where the chain is broken, the index at the end of the file, if
     there is one, tells where the next chunk begins.
     """
-    size = os.fstat(file.fileno()).st_size
+    now = os.fstat(file.fileno()).st_size
+    size = now if size is None else min(size, now)
     whole = _ends_with_magic(file, size)
     summary = _summary(file, size) if whole else None
     marks = _chunk_starts(summary, size)

@@ -66,7 +66,7 @@ def outline(path: Path) -> Outline:
         found.size = path.stat().st_size
         chunk: Record | None = None  # one whose messages have not been counted yet
         indexes: list[bytes] = []
-        for record in mcap_records.walk(file):
+        for record in mcap_records.walk(file, found.size):
             if isinstance(record, Record) and record.opcode == mcap_records.MESSAGE_INDEX:
                 indexes.append(mcap_records.body(file, record))
                 continue
