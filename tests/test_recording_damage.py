@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from recorded_shots import made_up_shots, record
 
-from scanmap.errors import CalibrationError, RecordingError
+from scanmap.errors import CalibrationError, ConfigError, RecordingError
 from scanmap.recording import describe, open_source, recover
 from scanmap.recording.mcap_records import CHUNK, MESSAGE_INDEX, Record, open_mcap, walk
 from scanmap.recording.shot_file import ShotFile
@@ -198,6 +198,19 @@ def test_recovery_makes_a_whole_file_of_what_is_whole(tmp_path: Path, seed: int)
         recover(path, out)
 
 
+def test_a_recording_that_grows_is_read_as_far_every_time(tmp_path: Path) -> None:
+    shots = made_up_shots(8)
+    whole = record(tmp_path / "whole.mcap", shots).read_bytes()
+    path = tmp_path / "growing.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    source = open_source(path)
+    first, faults = list(source.shots()), list(source.faults)
+    path.write_bytes(whole)
+    assert (list(source.shots()), source.faults) == (first, faults)
+    assert 2 <= len(first) < 8 and "is cut at byte" in faults[0]
+    assert list(open_source(path).shots()) == shots
+
+
 def test_recovery_finds_the_topics_at_the_end_of_the_file(tmp_path: Path) -> None:
     shots = made_up_shots(3)
     path = record(tmp_path / "a.mcap", shots)
@@ -210,7 +223,7 @@ def test_recovery_finds_the_topics_at_the_end_of_the_file(tmp_path: Path) -> Non
 
 def test_recovery_leaves_whole_and_empty_files_alone(tmp_path: Path) -> None:
     whole = record(tmp_path / "whole.mcap", made_up_shots(2))
-    with pytest.raises(RecordingError, match="is whole, there is nothing to recover"):
+    with pytest.raises(ConfigError, match="is whole, there is nothing to recover"):
         recover(whole, tmp_path / "saved.mcap")
     (tmp_path / "begun.mcap").write_bytes(whole.read_bytes()[:600])
     with pytest.raises(RecordingError, match="no whole message"):

@@ -187,6 +187,16 @@ def test_what_cannot_be_gone_on_with_is_refused_and_leaves_nothing(
     assert sorted(tmp_path.iterdir()) == there
 
 
+def test_a_scan_whose_file_alone_lost_its_end_is_recovered_not_gone_on_with(tmp_path: Path) -> None:
+    path = scan(tmp_path)
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(ConfigError, match=r"complete but for its end, .* 10 shots: scanmap recover .*a\.mcap, or"):
+        resume(path)
+    assert session.describe(path)[-1] == f"next: scanmap recover {path}"
+    assert session.recover(path)[0].endswith("10 shots, whole; " + f"{path} is as it was")
+    assert not any(line.startswith("next") for line in session.describe(tmp_path / "a.whole.mcap"))
+
+
 CONTINUOUS = ("sweep.mode='continuous'", "sweep.step_deg=2", "sweep.end_deg=30", "sweep.passes=2")
 
 
@@ -300,7 +310,7 @@ def test_recover_joins_parts_and_saves_what_a_cut_left(tmp_path: Path) -> None:
     assert replayed(joined, "d.ply") == (tmp_path / "whole" / "a.ply").read_bytes()
     with pytest.raises(ScanmapError, match="exists and is not overwritten"):
         session.recover(first)
-    with pytest.raises(ScanmapError, match="whole, there is nothing to recover"):
+    with pytest.raises(ConfigError, match="whole, there is nothing to recover"):
         session.recover(joined, tmp_path / "e.mcap")
     assert not (tmp_path / "e.mcap").exists()
     with pytest.raises(ConfigError, match=r"must end in \.mcap"):

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import scanmap
-from scanmap.errors import RecordingError
+from scanmap.errors import ConfigError, RecordingError
 from scanmap.recording import layout, mcap_records
 from scanmap.recording.info import RecordingInfo, describe
 from scanmap.recording.layout import RecordingParams
 from scanmap.recording.mcap_records import DamagedError, Record
+from scanmap.recording.outline import Outline
 from scanmap.recording.parts import part_outlines
 from scanmap.recording.shot_file import ShotFile
 
@@ -30,7 +31,8 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
         What the new file holds.
 
     Raises:
-        RecordingError: nothing is wrong with the recording, nothing can be saved, or `out` cannot be written.
+        ConfigError: nothing is wrong with the recording.
+        RecordingError: nothing can be saved, or `out` cannot be written.
     """
     path, out, params = Path(path), Path(out), params or RecordingParams()
     parts = part_outlines(path)
@@ -39,7 +41,7 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
     try:
         copy = _Copy(target, params.image_topic)
         for found in parts:
-            _copy(found.path, copy, is_last=found is last)
+            _copy(found, copy, is_last=found is last)
         if layout.END_METADATA not in last.metadata:
             end = {"reason": "cut", "shots": str(copy.images)}
             copy.writer.add_metadata(layout.END_METADATA, end | {layout.METADATA_CRC: layout.metadata_crc(end)})
@@ -49,7 +51,7 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
         if not copy.messages:
             raise RecordingError(f"recording {path} holds no whole message, there is nothing to recover")
         if not copy.lost and not any(found.damaged for found in parts) and len(parts) == 1:
-            raise RecordingError(
+            raise ConfigError(
                 f"recording {path} is whole, there is nothing to recover: scanmap replay {shlex.quote(str(path))}"
             )
     except BaseException as error:  # Ctrl-C too: half a file would pass for a whole one
@@ -62,14 +64,14 @@ def recover(path: Path | str, out: Path | str, params: RecordingParams | None = 
     return describe(out, params)
 
 
-def _copy(path: Path, copy: _Copy, *, is_last: bool) -> None:
+def _copy(found: Outline, copy: _Copy, *, is_last: bool) -> None:
     copy.begin(is_last=is_last)
-    with mcap_records.open_mcap(path) as file:
+    with mcap_records.open_mcap(found.path) as file:
         # Topics are named in the first chunks and again at the end: one of the two may be damaged.
-        for record in mcap_records.walk(file):
+        for record in mcap_records.walk(file, found.size):
             if isinstance(record, Record) and record.opcode in (mcap_records.SCHEMA, mcap_records.CHANNEL):
                 copy.take(file, record)
-        for record in mcap_records.walk(file):
+        for record in mcap_records.walk(file, found.size):
             if isinstance(record, Record):
                 copy.take(file, record)
 

@@ -50,7 +50,9 @@ def _describe_recording(path: Path) -> list[str]:
     unfinished = info.cut_at is not None or info.end_reason != "finished"
     if not (unfinished and info.has_rig and path.suffix == ".mcap"):
         return info.lines
-    return [*info.lines, f"next: scanmap scan --resume {shlex.quote(str(recording.first_part(path)))}"]
+    name = shlex.quote(str(recording.first_part(path)))
+    # Where its sweep ended in good order the file alone lacks its end, and no shot is left to be taken.
+    return [*info.lines, f"next: scanmap {'recover' if info.end_reason == 'finished' else 'scan --resume'} {name}"]
 
 
 def _describe_ply(path: Path) -> list[str]:

@@ -14,8 +14,8 @@ def recover(path: Path, out: Path | None = None) -> list[str]:
     """Copy what can be read into a new file; returns lines that say what was saved.
 
     Raises:
-        ConfigError: no such file, or names that cannot be.
-        RecordingError: nothing is wrong with it, nothing can be saved, or the new file cannot be written.
+        ConfigError: no such file, nothing is wrong with it, or names that cannot be.
+        RecordingError: nothing can be saved, or the new file cannot be written.
     """
     if path.suffix != ".mcap" or not path.is_file():
         what = "not a recording" if path.exists() else "there is no such file"

@@ -78,7 +78,11 @@ def earlier_parts(path: Path, settings: tuple[str, ...] = ()) -> Earlier:
         raise ConfigError(f"{path} has no shot from a bearing that can be trusted: scan again")
     done = frozenset(shot.index for shot in source.shots())
     if _is_complete(planned, done, ended=source.end_reason == "finished"):
-        raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {shlex.quote(str(path))}")
+        name = shlex.quote(str(path))
+        if source.end_reason == "cut":
+            lost = "complete but for its end, which is cut off"
+            raise ConfigError(f"{path} is {lost}, {len(done)} shots: scanmap recover {name}, or scanmap replay {name}")
+        raise ConfigError(f"{path} is complete, {len(done)} shots: scanmap replay {name}")
     return Earlier(
         source=source,
         landmarks=landmarks,
