@@ -35,6 +35,27 @@ def test_the_line_is_found_down_to_the_nearest_range(u, sigma, peak):
     assert abs(np.nanmean(off)) < 0.005
 
 
+@pytest.mark.parametrize(("sigma", "peak"), [(4.0, 30.0), (4.0, 60.0)])
+def test_a_bar_hardly_wide_enough_for_one_is_found_in_all_rows(sigma, peak):
+    """Some rows are profiles, of a height far beyond saturation, and some are bars: 0.89 and 0.94 of them were found."""
+    found = []
+    for seed in range(4):
+        column = 180.0 + seed + 0.1 * (np.arange(600) - 300.0)
+        light = peak * np.exp(-0.5 * ((np.arange(400.0) - column[:, None]) / sigma) ** 2)
+        light = 0.99 * light + 0.01 * cv2.GaussianBlur(light, (0, 0), 6.0)
+        pixels = srgb(light[..., None] * np.array([0.015, 0.06, 1.0]) + 0.02)
+        pixels += 1.5 * np.random.default_rng(seed).standard_normal(pixels.shape)
+        data = cv2.imencode(
+            ".jpg",
+            np.clip(np.rint(pixels), 0, 255).astype(np.uint8),
+            [cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422],
+        )[1]
+        off = find_laser_line(cv2.imdecode(data, cv2.IMREAD_COLOR), GAUSS).column_px - column
+        found.append(np.isfinite(off))
+        assert np.nanmax(np.abs(off)) < 1.0
+    assert np.mean(found) >= 0.985
+
+
 def test_a_window_as_wide_as_a_bar_has_no_beams_edges():
     image = np.full((400, 1600), 30.0)
     image[40:360, 700:760] = 400.0

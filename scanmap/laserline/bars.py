@@ -19,6 +19,7 @@ U8 = NDArray[np.uint8]
 Index = NDArray[np.intp]
 
 _LEAST_PX, _MOST_PX = 12, 150  # saturated columns side by side that make a bar
+_NEARLY_PX = 4.5  # width, as sigma, of a profile from which on it may be one in other rows
 _REACH = 110  # [px] half the window in which a bar's edges are looked for
 _LEVELS = (0.3, 0.45, 0.6, 0.75)  # of a bar's height at which its two edges are taken
 _SOFT = (0.03, 0.3)  # how wide an edge of a bar is, as a share of the bar
@@ -42,13 +43,16 @@ def take_bars(line: LaserLine, sight: Sight, params: LaserLineParams) -> None:
     """Rows that no profile was found in, but a saturated bar with a beam's edges."""
     if params.method != "gauss":
         return
-    lost = np.flatnonzero(line.reason != Reason.OK)
+    lost = line.reason != Reason.OK
+    # A bar hardly too narrow for one is a profile in some rows and none in others: together they are long enough.
+    asked = np.flatnonzero(lost | (line.width_px > _NEARLY_PX))
     lit = None if sight.off is None else sight.lit
-    for noise, own in zip(sight.noise, by_picture(lost // sight.height, len(sight.noise)), strict=True):
-        bars = find_bars(sight.plane, lost[own], SATURATED, noise, lit)
-        r = bars.row
-        line.column_px[r], line.sigma_px[r] = bars.column, bars.sigma_px
-        line.width_px[r], line.peak[r], line.reason[r] = bars.width_px, bars.height, Reason.OK
+    for noise, own in zip(sight.noise, by_picture(asked // sight.height, len(sight.noise)), strict=True):
+        bars = find_bars(sight.plane, asked[own], SATURATED, noise, lit)
+        new = lost[bars.row]
+        r = bars.row[new]
+        line.column_px[r], line.sigma_px[r] = bars.column[new], bars.sigma_px[new]
+        line.width_px[r], line.peak[r], line.reason[r] = bars.width_px[new], bars.height[new], Reason.OK
 
 
 def find_bars(plane: U8, rows: Index, saturated: int, noise: float, lit: U8 | None = None) -> Bars:

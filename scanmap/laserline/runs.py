@@ -109,7 +109,7 @@ def _blobs_of_one(wide: Array, across: Array, height: Array, strong: Mask, certa
     bright.partition(len(bright) // 2)
     sharp, usual = good[int(0.4 * len(good))], bright[len(bright) // 2]
     blob: Mask = (across > max(2.2 * sharp + 0.5, NO_BLOB_PX)) & (height < _NEAR)
-    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < 0.25 * usual)
+    blob |= (across > max(1.5 * sharp + 0.3, NO_BLOB_PX)) & (height < min(0.25 * usual, _NEAR))
     # As wide and dim as the unevenness of a wall.
     blob |= (across > _UNEVEN_PX) & (height < _UNEVEN_HEIGHT)
     return blob
