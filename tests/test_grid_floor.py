@@ -62,6 +62,45 @@ def test_a_single_bearing_gives_the_height_and_does_not_invent_a_tilt():
     assert floor.laser_height_m == pytest.approx(1.0, abs=0.002)
 
 
+# From many bearings of a room to ten of what a lens of 15 deg sees of the floor, 3.7 m away and farther.
+VIEWS = [
+    (np.arange(0, 180, 2), ROOM, 25.0, 3e-4, 0.001),
+    (np.arange(0, 180, 2), ROOM, 25.0, 1e-3, 0.002),
+    (np.arange(60, 120, 6), ((-4.0, -4.0, 0.0), (6.0, 5.0, 2.6)), 15.0, 1e-3, 0.2),
+]
+
+
+@pytest.mark.parametrize(("bearings", "room", "half_view_deg", "noise", "least"), VIEWS)
+def test_height_and_tilt_are_as_sure_as_they_say(bearings, room, half_view_deg, noise, least):
+    height, tilt, stated = [], [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        lean_x, lean_y = np.radians(rng.normal(0.0, 2.0, 2))
+        R = rotation_y(lean_y) @ rotation_x(lean_x)
+        scan = scan_room(bearings, room, half_view_deg=half_view_deg, R_room_world=R, noise=noise, rng=rng)
+        floor, up = find_floor(scan), R.T[:, 2]
+        if floor.how != "fitted":  # it leans so that the narrow lens looks over the floor, and says so
+            continue
+        off = np.degrees(np.hypot(*(floor.plane[:2] / floor.plane[2] - up[:2] / up[2])))
+        height.append((floor.plane[3] / floor.plane[2] - 1.0 / up[2]) / floor.height_sigma_m)
+        tilt.append(off / floor.tilt_sigma_deg)
+        stated.append(floor.height_sigma_m)
+    assert len(stated) >= 14
+    assert 0.3 < np.sqrt(np.mean(np.square(height))) < 1.3
+    assert 0.3 < np.sqrt(np.mean(np.square(tilt))) < 1.3
+    assert np.median(stated) < least
+
+
+def test_one_bearing_says_that_it_does_not_tell_a_table_from_the_floor():
+    scan = scan_room(np.array([0.0]), ROOM, [((0.5, -1.4, 0.5), (2.9, 2.4, 0.55))], rows=600)
+    floor = find_floor(scan)
+    assert (floor.how, floor.tilt_sigma_deg) == ("fitted", pytest.approx(2.0, abs=0.1))
+    assert "too little is in view to tell it from a table; set grid.laser_height_m" in floor.words
+    assert find_floor(scan, laser_height_m=1.0).how == "given"
+    whole = find_floor(scan_room(np.arange(0, 180, 6), ROOM, rows=300), laser_height_m=0.7)
+    assert (whole.how, "from a table" in whole.words) == ("fitted", False)
+
+
 @pytest.mark.parametrize("given_height", [None, 1.0])
 def test_without_a_floor_in_view_it_says_what_was_taken_instead(given_height):
     scan = scan_room(np.arange(0, 180, 3), ROOM, half_view_deg=13.0)

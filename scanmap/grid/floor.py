@@ -11,6 +11,7 @@ from scanmap.geometry import rigid
 from scanmap.scan import Scan
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 # A surface climbing less than this between two rows of a bearing is taken for horizontal.
 _HORIZONTAL_SLOPE = np.tan(np.radians(15.0))
@@ -20,6 +21,10 @@ _MIN_SUPPORT = 40
 _MAX_BELOW, _CLEARLY_BELOW_M = 0.03, 0.1
 # How far a scanner put up by hand leans [rad]: it decides where the view alone cannot tell, as with one bearing.
 _LEAN = np.radians(2.0)
+# Points of one bearing share their errors: so many of them tell as much as one would alone.
+_SHARED = 100.0
+# From so uncertain a tilt on, the view does not tell a floor from a table in front of it [deg].
+_UNTOLD_TILT_DEG = 1.0
 
 
 class Floor(NamedTuple):
@@ -29,6 +34,8 @@ class Floor(NamedTuple):
     sigma_m: float  # rms distance of its points from the plane; NaN where it was not fitted
     points: int  # how many points (of a thinned scan) it stands on
     how: Literal["fitted", "given", "lowest"]
+    height_sigma_m: float = np.nan  # of the laser's height above it; NaN where it was not fitted
+    tilt_sigma_deg: float = np.nan  # of its tilt, where that is known least
 
     @property
     def laser_height_m(self) -> float:
@@ -56,9 +63,13 @@ class Floor(NamedTuple):
         """How the floor was found, as a summary prints it."""
         place = f"{self.laser_height_m:.3f} m below the laser"
         if self.how == "fitted":
-            return f"floor {place}, tilted {self.tilt_deg:.2f} deg, rms {1e3 * self.sigma_m:.1f} mm"
+            sure = f"sure to {1e3 * self.height_sigma_m:.1f} mm and {self.tilt_sigma_deg:.2f} deg"
+            words = f"floor {place}, tilted {self.tilt_deg:.2f} deg, rms {1e3 * self.sigma_m:.1f} mm, {sure}"
+            if self.tilt_sigma_deg < _UNTOLD_TILT_DEG:
+                return words
+            return f"{words}: too little is in view to tell it from a table; set grid.laser_height_m if you know better"
         if self.how == "given":
-            return f"no floor in view: taken {place} as configured"
+            return f"too little floor in view: taken {place} as configured"
         return f"no floor in view: lowest points taken for it, {place}; set grid.laser_height_m if you know better"
 
 
@@ -71,24 +82,29 @@ def find_floor(scan: Scan, laser_height_m: float | None = None, max_tilt_deg: fl
 
     Args:
         scan: points in the world frame.
-        laser_height_m: where the floor is taken to be when none is in view; None: at the lowest points.
+        laser_height_m: where the floor is taken to be when none, or too little, is in view; None: at the lowest points.
         max_tilt_deg: largest tilt of the axis against the floor's normal that is looked for.
     """
-    points, sigma, level = _candidates(scan)
+    points, sigma, level, bearing = _candidates(scan)
     low = level & (points[:, 2] < -0.02)
     if low.sum() >= _MIN_SUPPORT:
         # Floor, table and shelf are parallel: the strongest layer tells the tilt, the lowest strong one is the floor.
         # But a leaning layer may be made of bits of several things, two tables for one: what explains most counts.
         tries = [
-            _settled(points[low], sigma[low], np.radians(tilt), refined)
+            _settled(points[low], sigma[low], bearing[low], np.radians(tilt), refined)
             for tilt in (max_tilt_deg, 0.0)
             for refined in (True, False)
         ]
-        slope, inliers, rms = max(tries, key=lambda found: found[1] * (_share_below(points, found[0]) < _MAX_BELOW))
+        slope, inliers, rms, covariance = max(
+            tries, key=lambda found: found[1] * (_share_below(points, found[0]) < _MAX_BELOW)
+        )
         steep = np.hypot(slope[0], slope[1]) > np.tan(np.radians(max_tilt_deg + 1.0))
         above_others = _share_below(points, slope) >= _MAX_BELOW
         if inliers >= _MIN_SUPPORT and slope[2] < 0.0 and not steep and not above_others:
-            return Floor(_plane(slope), rms, inliers, "fitted")
+            tilt_sigma = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
+            # A height that is given tells more than a view that does not tell a floor from a table.
+            if laser_height_m is None or tilt_sigma < _UNTOLD_TILT_DEG:
+                return Floor(_plane(slope), rms, inliers, "fitted", float(np.sqrt(covariance[2, 2])), tilt_sigma)
     if laser_height_m is not None:
         return Floor(np.array([0.0, 0.0, 1.0, laser_height_m]), np.nan, 0, "given")
     lowest = float(np.percentile(points[:, 2], 0.1)) if len(points) else 0.0
@@ -101,14 +117,16 @@ def _share_below(points: Array, slope: Array) -> float:
     return float((height < -_CLEARLY_BELOW_M).mean())
 
 
-def _settled(points: Array, sigma: Array, max_tilt: float, refined: bool) -> tuple[Array, int, float]:
-    """The lowest strong layer parallel to the strongest one: slope (3,), number of inliers, their rms [m].
+def _settled(
+    points: Array, sigma: Array, bearing: Index, max_tilt: float, refined: bool
+) -> tuple[Array, int, float, Array]:
+    """The lowest strong layer parallel to the strongest one, as `_refine` has it.
 
     `refined`: the strongest layer's tilt is that of a plane fitted to it, else the coarse one it was found with.
     """
     seed = _strongest_layer(points, max_tilt)
-    seed[2] = _lowest_layer(points, _refine(points, sigma, seed)[0] if refined else seed)
-    return _refine(points, sigma, seed)
+    seed[2] = _lowest_layer(points, _refine(points, sigma, bearing, seed)[0] if refined else seed)
+    return _refine(points, sigma, bearing, seed)
 
 
 def _plane(slope: Array) -> Array:
@@ -118,8 +136,8 @@ def _plane(slope: Array) -> Array:
     return scaled
 
 
-def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Thinned points (N, 3), their sigma (N,) and whether the surface there is nearly horizontal (N,)."""
+def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_], Index]:
+    """Thinned points (N, 3), their sigma (N,), whether it is nearly level there, and their bearing (N,)."""
     across = max(1, len(scan) // 120)
     down = max(1, scan.rows // int(np.clip(18000 * across / max(len(scan), 1), 150, 600)))
     points = scan.points[::across, ::down].astype(np.float64)
@@ -132,7 +150,7 @@ def _candidates(scan: Scan) -> tuple[Array, Array, NDArray[np.bool_]]:
         flat = _runs_level(points[..., 2], rho, sigma, step)
         level[:, step:-step] |= flat[:, step:] & flat[:, :-step]  # on both sides: the foot of a wall is not floor
     some = np.isfinite(points).all(axis=-1)
-    return points[some], sigma[some], level[some]
+    return points[some], sigma[some], level[some], np.nonzero(some)[0]
 
 
 def _runs_level(height: Array, rho: Array, sigma: Array, step: int) -> NDArray[np.bool_]:
@@ -173,11 +191,12 @@ def _layers(height: Array, thick: float) -> tuple[NDArray[np.intp], float]:
     return np.convolve(count, [1, 1]), bottom
 
 
-def _refine(points: Array, sigma: Array, slope: Array) -> tuple[Array, int, float]:
-    """Least squares over ever closer points: slope (3,), number of inliers, their rms [m]."""
+def _refine(points: Array, sigma: Array, bearing: Index, slope: Array) -> tuple[Array, int, float, Array]:
+    """Least squares over ever closer points: slope (3,), number of inliers, their rms [m], covariance (3, 3)."""
     A = np.column_stack([points[:, :2], np.ones(len(points))])
     inlier = np.zeros(len(points), dtype=bool)
     residual: NDArray[Any] = points[:, 2] - A @ slope
+    covariance = np.diag([_LEAN**2, _LEAN**2, 1.0])
     for gate in (0.15, 0.08, 0.05, 0.03, 0.015, 0.015):
         # Height follows the ray's error by less than one; sigma as it is makes a generous gate.
         inlier = np.abs(residual) < np.maximum(gate, 3.0 * np.minimum(sigma, 0.03))
@@ -185,10 +204,29 @@ def _refine(points: Array, sigma: Array, slope: Array) -> tuple[Array, int, floa
             break
         weight = inlier / (sigma**2 + 0.003**2)
         normal = A.T @ (A * weight[:, None])
-        # Points of one bearing share their errors; a hundred of them tell the slope as one would.
-        normal[[0, 1], [0, 1]] += 100.0 / _LEAN**2
+        normal[[0, 1], [0, 1]] += _SHARED / _LEAN**2
         slope = np.linalg.solve(normal, A.T @ (weight * points[:, 2]))
         residual = points[:, 2] - A @ slope
+        covariance = _covariance(A * weight[:, None], A, residual, bearing, normal)
     count = int(inlier.sum())
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if count else np.nan
-    return slope, count, rms
+    return slope, count, rms, covariance
+
+
+def _covariance(weighted: Array, A: Array, residual: Array, bearing: Index, normal: Array) -> Array:
+    """Covariance (3, 3) of a fit whose points (N,) share errors along a bearing: cluster-robust (Liang, Zeger 1986).
+
+    What the prior on the tilt holds back counts too, as large as a scanner leans.
+
+    Args:
+        weighted: (N, 3) rows of `A` times their weight.
+        normal: of the fit, with its prior.
+    """
+    inverse, data = np.linalg.inv(normal), A.T @ weighted
+    scores = np.stack([np.bincount(bearing, weighted[:, k] * residual) for k in range(3)], axis=1)
+    bearings = len(np.unique(bearing[weighted[:, 2] > 0]))
+    # As many bearings as unknowns scatter about nothing.
+    scatter = scores.T @ scores * bearings / (bearings - 3) if bearings > 3 else _SHARED * data
+    prior = (normal - data)[:, :2]
+    covariance: Array = inverse @ (data + scatter + _LEAN**2 * prior @ prior.T) @ inverse
+    return covariance
