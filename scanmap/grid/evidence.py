@@ -39,7 +39,9 @@ class GridParams(BaseModel, frozen=True, extra="forbid"):
     min_hit_rows: int = Field(2, ge=1, description="rows that must agree on a hit")
     max_beam_deg: float = Field(8.0, gt=0, le=45, description="bearings farther apart leave unknown between them [deg]")
     laser_height_m: float | None = Field(
-        None, gt=0, description="laser above the floor where none or too little of it is in view; left out: the lowest points [m]"
+        None,
+        gt=0,
+        description="laser above the floor where too little of that is in view; else the lowest points [m]",
     )
     max_tilt_deg: float = Field(8.0, gt=0, le=30, description="largest tilt of the axis against the floor [deg]")
 
