@@ -66,7 +66,7 @@ def test_a_single_bearing_gives_the_height_and_does_not_invent_a_tilt():
 VIEWS = [
     (np.arange(0, 180, 2), ROOM, 25.0, 3e-4, 0.001),
     (np.arange(0, 180, 2), ROOM, 25.0, 1e-3, 0.002),
-    (np.arange(60, 120, 6), ((-4.0, -4.0, 0.0), (6.0, 5.0, 2.6)), 15.0, 1e-3, 0.2),
+    (np.arange(60, 120, 6), ((-4.0, -4.0, 0.0), (6.0, 5.0, 2.6)), 15.0, 1e-3, 0.01),
 ]
 
 

@@ -21,7 +21,7 @@ _MIN_SUPPORT = 40
 _MAX_BELOW, _CLEARLY_BELOW_M = 0.03, 0.1
 # How far a scanner put up by hand leans [rad]: it decides where the view alone cannot tell, as with one bearing.
 _LEAN = np.radians(2.0)
-# Points of one bearing share their errors: so many of them tell as much as one would alone.
+# Points of one bearing share their errors: before scatter says how many tell as much as one would, and where it cannot.
 _SHARED = 100.0
 # From so uncertain a tilt on, the view does not tell a floor from a table in front of it [deg].
 _UNTOLD_TILT_DEG = 1.0
@@ -194,7 +194,7 @@ def _layers(height: Array, thick: float) -> tuple[NDArray[np.intp], float]:
 def _refine(points: Array, sigma: Array, bearing: Index, slope: Array) -> tuple[Array, int, float, Array]:
     """Least squares over ever closer points: slope (3,), number of inliers, their rms [m], covariance (3, 3)."""
     A = np.column_stack([points[:, :2], np.ones(len(points))])
-    inlier = np.zeros(len(points), dtype=bool)
+    inlier, shared = np.zeros(len(points), dtype=bool), _SHARED
     residual: NDArray[Any] = points[:, 2] - A @ slope
     covariance = np.diag([_LEAN**2, _LEAN**2, 1.0])
     for gate in (0.15, 0.08, 0.05, 0.03, 0.015, 0.015):
@@ -204,13 +204,23 @@ def _refine(points: Array, sigma: Array, bearing: Index, slope: Array) -> tuple[
             break
         weight = inlier / (sigma**2 + 0.003**2)
         normal = A.T @ (A * weight[:, None])
-        normal[[0, 1], [0, 1]] += _SHARED / _LEAN**2
+        normal[[0, 1], [0, 1]] += shared / _LEAN**2
         slope = np.linalg.solve(normal, A.T @ (weight * points[:, 2]))
         residual = points[:, 2] - A @ slope
         covariance = _covariance(A * weight[:, None], A, residual, bearing, normal)
+        shared = _shared(A * weight[:, None], A, residual, bearing)
     count = int(inlier.sum())
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if count else np.nan
     return slope, count, rms, covariance
+
+
+def _shared(weighted: Array, A: Array, residual: Array, bearing: Index) -> float:
+    """How many points tell the slope as one would: the scatter of whole bearings over what single points foretell."""
+    if len(np.unique(bearing[weighted[:, 2] > 0])) <= 3:
+        return _SHARED
+    scatter = [float((np.bincount(bearing, weighted[:, k] * residual) ** 2).sum()) for k in range(2)]
+    foretold = np.einsum("ij,ij->j", weighted, A)[:2]
+    return float(np.clip((scatter / np.maximum(foretold, 1e-12)).max(), 1.0, _SHARED))
 
 
 def _covariance(weighted: Array, A: Array, residual: Array, bearing: Index, normal: Array) -> Array:
@@ -228,5 +238,7 @@ def _covariance(weighted: Array, A: Array, residual: Array, bearing: Index, norm
     # As many bearings as unknowns scatter about nothing.
     scatter = scores.T @ scores * bearings / (bearings - 3) if bearings > 3 else _SHARED * data
     prior = (normal - data)[:, :2]
+    if bearings > 3:  # what single points foretell, by how far they lie off
+        data = data * float((weighted[:, 2] * residual**2).sum() / np.count_nonzero(weighted[:, 2]))
     covariance: Array = inverse @ (data + scatter + _LEAN**2 * prior @ prior.T) @ inverse
     return covariance
