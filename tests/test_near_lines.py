@@ -37,7 +37,7 @@ def test_the_line_is_found_down_to_the_nearest_range(u, sigma, peak):
 
 @pytest.mark.parametrize(("sigma", "peak"), [(4.0, 30.0), (4.0, 60.0)])
 def test_a_bar_hardly_wide_enough_for_one_is_found_in_all_rows(sigma, peak):
-    """Some rows are profiles, of a height far beyond saturation, and some are bars: 0.89 and 0.94 of them were found."""
+    """Some rows are profiles, of a height far beyond saturation, and some are bars: 0.89 and 0.94 were found."""
     found = []
     for seed in range(4):
         column = 180.0 + seed + 0.1 * (np.arange(600) - 300.0)

@@ -21,7 +21,7 @@ _MIN_SUPPORT = 40
 _MAX_BELOW, _CLEARLY_BELOW_M = 0.03, 0.1
 # How far a scanner put up by hand leans [rad]: it decides where the view alone cannot tell, as with one bearing.
 _LEAN = np.radians(2.0)
-# Points of one bearing share their errors: so many tell as much as one would, where their scatter does not say it.
+# Points of one bearing share their errors: so many tell as much as one would, unless their scatter tells better.
 _SHARED = 100.0
 # From so uncertain a tilt on, the view does not tell a floor from a table in front of it [deg].
 _UNTOLD_TILT_DEG = 1.0
