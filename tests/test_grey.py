@@ -111,6 +111,17 @@ def test_the_off_frame_takes_the_room_away_whatever_its_exposure(gain):
     assert abs(lit[:, 101].mean() - level - 80.0) < 3.0
 
 
+def test_of_an_even_room_the_off_frame_adds_hardly_any_noise_and_of_its_edges_nothing_stays():
+    """A mean of 25 pixels adds a fiftieth to the noise; of 9, an eighteenth."""
+    rng = np.random.default_rng(4)
+    room = np.full((400, 400), 60.0, np.float32)
+    room[:, 200:] = 110.0
+    on, off = sensor(room, 3.0, rng), sensor(room, 3.0, rng)
+    lit = without_background(on, off).astype(np.float64)
+    assert lit[:, :190].std() / on[:, :190].std() < 1.04
+    assert abs(lit[:, 195:205].mean(axis=0) - np.median(lit)).max() < 1.0
+
+
 def test_the_off_threshold_takes_small_differences_for_none():
     rng = np.random.default_rng(3)
     room = np.full((80, 80), 60.0, np.float32)

@@ -76,14 +76,15 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
 PEDESTAL = 16
 _ROWS_AT_ONCE = 120
 _ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
+_EVEN_PX, _EVEN = 5, 8  # columns and rows over which means of 3 x 3 neighbours differ by no more [grey levels]
 
 
 def without_background(plane: U8, background: U8, threshold: float = 0.0, gain: float | None = None) -> U8:
     """What the laser added (H, W): laser on minus laser off, lifted by `PEDESTAL`.
 
     The exposure may have changed between the two: the off-plane is first brought to the on-plane's level by
-    the gain that matches them where neither saturates, measured on a coarse grid. It is smoothed over 3x3
-    pixels where it is even, which takes two thirds of its noise; where it has edges they must stay what they are.
+    the gain that matches them where neither saturates, measured on a coarse grid. It is smoothed over 5x5 or 3x3
+    pixels where it is even, which takes most of its noise; where it has edges they must stay what they are.
     What the off-plane saturates in tells nothing and counts as no light.
 
     Args:
@@ -92,26 +93,32 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0, gain: 
     """
     gain = exposure_gain(plane[::8, ::8], background[::8, ::8]) if gain is None else gain
     lit = np.empty(plane.shape, np.uint8)
-    # Some rows at a time, which stay in the processor's cache from step to step; smoothing needs one more on each side.
+    # Some rows at a time, which stay in the processor's cache from step to step; smoothing needs more on each side.
     for top in range(0, len(plane), _ROWS_AT_ONCE):
-        first, end = max(top - 1, 0), top + _ROWS_AT_ONCE
-        part = _less(plane[first : end + 1], background[first : end + 1], threshold, gain)
+        first, end = max(top - _EVEN_PX, 0), top + _ROWS_AT_ONCE
+        part = _less(plane[first : end + _EVEN_PX], background[first : end + _EVEN_PX], threshold, gain)
         lit[top:end] = part[top - first : end - first]
     return lit
 
 
 def _less(plane: U8, background: U8, threshold: float, gain: float) -> U8:
-    smooth = cv2.blur(background, (3, 3))
-    around = np.ones((3, 3), np.uint8)
-    rough = cv2.subtract(cv2.dilate(background, around), cv2.erode(background, around))
-    _, rough = cv2.threshold(rough, _ROUGH, 255, cv2.THRESH_BINARY)
-    lit = cv2.addWeighted(plane, 1.0, cv2.copyTo(background, rough, smooth), -gain, float(PEDESTAL))
+    # Over few pixels where they are alike, and over more where these means are.
+    few = cv2.copyTo(background, _rough(background, 3, _ROUGH), cv2.blur(background, (3, 3)))
+    even = cv2.copyTo(few, _rough(few, _EVEN_PX, _EVEN), cv2.blur(background, (_EVEN_PX, _EVEN_PX)))
+    lit = cv2.addWeighted(plane, 1.0, even, -gain, float(PEDESTAL))
     _, blind = cv2.threshold(background, SATURATED - 1, 255, cv2.THRESH_BINARY)
     if cv2.countNonZero(blind):
         lit[blind > 0] = PEDESTAL
     if threshold > 0:
         lit[lit < PEDESTAL + threshold] = PEDESTAL
     return np.asarray(lit, np.uint8)
+
+
+def _rough(plane: U8, size: int, most: int) -> U8:
+    """255 where pixels of a plane differ by more than that from one another within so many columns and rows."""
+    around = np.ones((size, size), np.uint8)
+    differ = cv2.subtract(cv2.dilate(plane, around), cv2.erode(plane, around))
+    return np.asarray(cv2.threshold(differ, most, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
 def binary_image(plane: U8) -> U8:
