@@ -103,7 +103,7 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0, gain: 
 
 def _less(plane: U8, background: U8, threshold: float, gain: float) -> U8:
     # Over few pixels where they are alike, and over more where these means are.
-    few = cv2.copyTo(background, _rough(background, 3, _ROUGH), cv2.blur(background, (3, 3)))
+    few = np.asarray(cv2.copyTo(background, _rough(background, 3, _ROUGH), cv2.blur(background, (3, 3))), np.uint8)
     even = cv2.copyTo(few, _rough(few, _EVEN_PX, _EVEN), cv2.blur(background, (_EVEN_PX, _EVEN_PX)))
     lit = cv2.addWeighted(plane, 1.0, even, -gain, float(PEDESTAL))
     _, blind = cv2.threshold(background, SATURATED - 1, 255, cv2.THRESH_BINARY)
