@@ -46,3 +46,8 @@ def test_ripples_of_the_compression_go_both_ways_and_are_elsewhere_too():
 def test_what_an_edge_out_of_its_place_leaves_is_no_line(step, told):
     away = np.arange(WIDTH) - COLUMN[:, None]
     assert asked(LINE, 60.0 + step * (away > 0.0)) == told
+
+
+def test_a_picture_whose_line_was_given_up_has_nothing_to_be_borne_out():
+    plane = np.zeros((40, 200), np.uint8)
+    assert not borne_out(np.full(40, np.nan), np.ones(40, bool), 18, plane, plane, 1.0).any()

@@ -12,6 +12,7 @@ from scanmap.laserline.channel import SATURATED
 from scanmap.laserline.path import strips
 from scanmap.laserline.peaks import Peaks, fit_gaussian
 from scanmap.laserline.pictures import Rows, not_one
+from scanmap.laserline.rounding import is_compressed
 from scanmap.laserline.samples import Samples, ends
 from scanmap.laserline.sight import Sight
 
@@ -30,6 +31,8 @@ _PLACES_PX = np.arange(-6.0, 6.1, 1.0, dtype=np.float32)  # of the edge, from th
 _STEPS, _LONG = 4, 0.15  # at most, and [widths] what is long
 _REST = 0.15  # of what an edge may do to a line, is left where its explanations agree
 _FARTHEST = 1.0  # [widths] that an edge is believed to move a line by
+_TRUE = 2  # place of the light as it is among the kinds that `_added` gives
+_CURVE_ROWS, _CURVE_DOUBT_PX = 9, 0.12  # over which a camera's curve does the same, and half of which is believed
 _BLUR_PX = 0.8  # of an edge, by optics and pixels
 _RATIO = 4.0  # of the two sides, at most
 _LEAST = 1.0  # [grey levels] of a side
@@ -113,7 +116,8 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     Paint dims both lights alike: what the laser added, over what was there without it, is the same on dark paint and on
     light. Where only the room's light differs (a shadow, a lamp), what a camera codes of the same laser is less on the
     bright side; its light is the same. Which it is, and by what curve light is coded, is not known: how far the line's
-    places by all of these are from each other counts as doubt.
+    places by all of these are from each other counts as doubt. Of pictures that a camera compressed the curve is: there
+    the line is moved to where its light is.
     """
     edges = no_edges(len(good))
     assert sight.off is not None
@@ -140,7 +144,26 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     found = fit_gaussian(even.reshape(len(even), -1), many, alone, peaks.contrast)
     u = found.offset_px.reshape(even.shape[1:]) - peaks.offset_px[which]
     edges.doubt[which] = np.minimum(np.maximum(u, -_MOVES), _MOVES).std(axis=0)
+    if is_compressed(sight.roundings[0]):
+        edges.shift[which] = _by_curve(u[_TRUE], rows[some], len(sight.off))
     return edges
+
+
+def _by_curve(moved: F32, row: Index, height: int) -> F32:
+    """What is to be believed of how far lines in `row` (M,) are `moved` (M,) [px] to where their light is.
+
+    Cameras that compress code light by a curve. One row's noise is as large as what that does to most lines; what all
+    rows around have in common is not, and counts the more the larger it is.
+    """
+    total, count = np.zeros((2, height), np.float32)
+    total[row], count[row] = np.minimum(np.maximum(moved, -_FARTHEST), _FARTHEST), 1.0
+    sums, rows = (
+        np.asarray(cv2.blur(v[None], (_CURVE_ROWS, 1), borderType=cv2.BORDER_CONSTANT)[0], np.float32)[row]
+        for v in (total, count)
+    )
+    common = sums / rows
+    believed: F32 = common * (np.square(common) / (np.square(common) + np.float32(_CURVE_DOUBT_PX**2)))
+    return believed
 
 
 def _added(lit: F32, dark: F32) -> F32:

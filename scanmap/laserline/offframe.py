@@ -23,6 +23,7 @@ _CONTRAST = 16  # [grey levels] from which on a place has any
 _BRIGHTEST = 240  # [grey levels] brighter ones are cut
 _ROW_STEP = 8
 _FEW = 50
+_OWN_PX = 12  # on either side of the line, where the difference is its own light
 _SHARE = 0.04  # of a contrast that a shaken camera leaves besides
 # A run, asked along it as a whole: rows that it has at least, and how far they lie from a straight line.
 _RUN_ROWS, _STRAIGHT_PX = 4, 0.8
@@ -59,7 +60,7 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
     """
     ratio = np.full(len(column), np.inf)
     row = np.flatnonzero(np.isfinite(column))
-    left = _remaining(image, background, gain) if row.size else 0.0
+    left = _remaining(image, background, gain, column) if row.size else 0.0
     if left > 0.0:
         middle = np.rint(column[row]).astype(np.intp)
         x = np.clip(middle[:, None] + np.arange(-_REACH, _REACH + 1), 0, background.shape[1] - 1)
@@ -70,14 +71,17 @@ def standing_out(column: F64, peak: F64, image: U8, background: U8, gain: float)
     return ratio
 
 
-def _remaining(image: U8, background: U8, gain: float) -> float:
-    """Standard deviation of the difference where there is contrast [grey levels]; 0 where there is none."""
+def _remaining(image: U8, background: U8, gain: float, column: F64) -> float:
+    """Standard deviation of the difference where there is contrast [grey levels]; 0 where only the line has any."""
     on, off = (np.ascontiguousarray(plane[_ROW_STEP // 2 :: _ROW_STEP]) for plane in (image, background))
     if not len(on):
         return 0.0
     around = np.ones((1, 2 * _REACH + 1), np.uint8)
     contrast = np.asarray(cv2.subtract(cv2.dilate(off, around), cv2.erode(off, around)))
     usable = (contrast * np.float32(gain) > _CONTRAST) & (cv2.max(on, off) < _BRIGHTEST)
+    line = column[_ROW_STEP // 2 :: _ROW_STEP]
+    for k in np.flatnonzero(np.isfinite(line)).tolist():
+        usable[k, max(0, int(line[k]) - _OWN_PX) : int(line[k]) + _OWN_PX + 1] = False
     if np.count_nonzero(usable) < _FEW:
         return 0.0
     left = np.abs(on[usable] - gain * off[usable].astype(np.float32))
@@ -101,7 +105,7 @@ def borne_out(column: F64, doubtful: Mask, most: int, lit: U8, background: U8, g
     """
     borne = np.zeros(len(column), bool)
     row = np.flatnonzero(np.isfinite(column))
-    if not doubtful.any() or lit.shape[1] <= 2 * _HALF:
+    if not row.size or not doubtful.any() or lit.shape[1] <= 2 * _HALF:
         return borne
     run = numbered(row, column[row], GAP_ROWS + 1, len(column))
     length = np.bincount(run)

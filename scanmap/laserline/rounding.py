@@ -61,6 +61,11 @@ class Mixture(NamedTuple):
     share: float = 1.0  # of it; the rest is its neighbour's
 
 
+def is_compressed(rounding: Rounding | None) -> bool:
+    """Whether a picture is known to have been a JPEG."""
+    return rounding is not None and rounding is not _NOTHING
+
+
 def rounding_of(data: bytes) -> Rounding | None:
     """The rounding of an encoded picture; None of a JPEG whose header cannot be read."""
     at, tables = 2, b""
