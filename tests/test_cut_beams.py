@@ -107,9 +107,16 @@ def post(side: int) -> dict[int, list[F64 | None]]:
     return {CUT + side: [None if k in inside else np.empty(0) for k in range(HEIGHT)]}
 
 
-@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_what_is_left_of_a_cut_beam_is_put_back(share: float, side: int) -> None:
+@pytest.mark.parametrize(
+    ("beam_px", "psf_px", "share"),
+    [(1.3, 0.8, 0.25), (1.3, 0.8, 0.5), (1.3, 0.8, 0.75), (2.6, 0.6, 0.25), (2.6, 0.6, 0.5)],
+)
+def test_what_is_left_of_a_cut_beam_is_put_back(
+    share: float, side: int, beam_px: float, psf_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{__name__}.BEAM_PX", beam_px)
+    monkeypatch.setattr(f"{__name__}.PSF_PX", psf_px)
     calibration = head()
     # Greater bearings are to the left in the picture: what the post on that side takes is the beam's left part.
     beam = cut_beam(share, float(-side))

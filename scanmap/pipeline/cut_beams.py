@@ -41,6 +41,9 @@ _SAME, _OTHER = 0.05, 0.12  # of its range, up to which a bearing's surface may 
 _FLAT_PX = 0.2  # by which half of the points of a plane lie off it, at most
 _FITS, _FAR_OFF = 3, 4.0  # of a plane, and how many medians a point is off it that is none of its own
 _LEAST, _MOST = 0.6, 1.4  # how far points lie off the plane, in terms of what light and width foretell
+# A Gaussian fitted to what is left of a beam is narrower than its variance is: where hardly any blur is added to the
+# sheet's own width, these together make it 1.11 of the line's variance (of shares of 0.2 to 0.5); the rest is scatter.
+_SHEET = 1.15
 _UNKNOWN = 0.3  # of how far a line was moved
 
 
@@ -147,7 +150,7 @@ def _foretold(share: F64, narrow: F64, whole: F32) -> float:
     t = NormalDist().inv_cdf(f)
     m = NormalDist().pdf(t) / f
     beam = (1.0 - float(np.median(narrow)) ** 2) / (t * m + m * m)  # of the line's variance
-    return float(np.nanmedian(whole)) * float(np.sqrt(beam)) * m if beam < 1.0 else float("inf")
+    return float(np.nanmedian(whole)) * float(np.sqrt(min(beam, 1.0))) * m if beam < _SHEET else float("inf")
 
 
 def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Beside) -> tuple[float, F64]:
