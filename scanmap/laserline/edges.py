@@ -31,7 +31,8 @@ _PLACES_PX = np.arange(-6.0, 6.1, 1.0, dtype=np.float32)  # of the edge, from th
 _STEPS, _LONG = 4, 0.15  # at most, and [widths] what is long
 _REST = 0.15  # of what an edge may do to a line, is left where its explanations agree
 _FARTHEST = 1.0  # [widths] that an edge is believed to move a line by
-_TRUE = 2  # place of the light as it is among the kinds that `_added` gives
+_TRUE, _PAINT = 2, 3  # places of the light as it is, and over what was there, among the kinds that `_added` gives
+_SHADOW = 0.1  # by which the former must explain lines better, as the logarithm of what a Gaussian leaves of them
 _CURVE_ROWS, _CURVE_DOUBT_PX = 9, 0.12  # over which a camera's curve does the same, and half of which is believed
 _BLUR_PX = 0.8  # of an edge, by optics and pixels
 _RATIO = 4.0  # of the two sides, at most
@@ -145,23 +146,26 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     u = found.offset_px.reshape(even.shape[1:]) - peaks.offset_px[which]
     edges.doubt[which] = np.minimum(np.maximum(u, -_MOVES), _MOVES).std(axis=0)
     if is_compressed(sight.roundings[0]):
-        edges.shift[which] = _by_curve(u[_TRUE], rows[some], len(sight.off))
+        misfit = (found.noise / np.maximum(found.height, np.float32(1.0))).reshape(u.shape)
+        shadow = np.log(misfit[_PAINT] / misfit[_TRUE])
+        edges.shift[which] = _by_curve(u[_TRUE], shadow, rows[some], len(sight.off))
     return edges
 
 
-def _by_curve(moved: F32, row: Index, height: int) -> F32:
+def _by_curve(moved: F32, shadow: F32, row: Index, height: int) -> F32:
     """What is to be believed of how far lines in `row` (M,) are `moved` (M,) [px] to where their light is.
 
     Cameras that compress code light by a curve. One row's noise is as large as what that does to most lines; what all
-    rows around have in common is not, and counts the more the larger it is.
+    rows around have in common is not, and counts the more the larger it is. Where they are paint's as well as a
+    `shadow`'s (M,) nothing is moved.
     """
-    total, count = np.zeros((2, height), np.float32)
-    total[row], count[row] = np.minimum(np.maximum(moved, -_FARTHEST), _FARTHEST), 1.0
-    sums, rows = (
+    total, count, kind = np.zeros((3, height), np.float32)
+    total[row], count[row], kind[row] = np.minimum(np.maximum(moved, -_FARTHEST), _FARTHEST), 1.0, shadow
+    sums, rows, kinds = (
         np.asarray(cv2.blur(v[None], (_CURVE_ROWS, 1), borderType=cv2.BORDER_CONSTANT)[0], np.float32)[row]
-        for v in (total, count)
+        for v in (total, count, kind)
     )
-    common = sums / rows
+    common = sums / rows * (kinds > np.float32(_SHADOW) * rows)
     believed: F32 = common * (np.square(common) / (np.square(common) + np.float32(_CURVE_DOUBT_PX**2)))
     return believed
 
