@@ -1,6 +1,7 @@
 """Image (+ background) to `LaserLine`: one sub-pixel column per row."""
 
 from scanmap.laserline.candidates import BLOCK
+from scanmap.laserline.flanks import ROWS, UNUSUAL, Moved, by_clean_flanks
 from scanmap.laserline.grey import binary_image, overlay, to_grey
 from scanmap.laserline.line import find_laser_line, laser_of, look, look_at_all
 from scanmap.laserline.params import LaserLineParams, needs_colour
@@ -11,13 +12,17 @@ from scanmap.laserline.sight import Laser
 
 __all__ = [
     "BLOCK",
+    "ROWS",
+    "UNUSUAL",
     "Laser",
     "LaserLine",
     "LaserLineParams",
     "Look",
+    "Moved",
     "Reason",
     "Rounding",
     "binary_image",
+    "by_clean_flanks",
     "find_laser_line",
     "laser_of",
     "look",

@@ -151,7 +151,7 @@ def improve(y: F32, x: F32, weight: F32, fit: Fit, limit: F32) -> Fit:
     normal = np.zeros((4, 5, y.shape[1]))
     for i, own in enumerate((weight, weight * g, weight * q, weight * d)):
         normal[i, i:] = np.einsum("jn,kjn->kn", own, basis[i:])
-    (b, A, t, p), information = _solved(normal)
+    (b, A, t, p), information = solved(normal)
     A = np.maximum(A, 0.5)
     half = len(x) // 2
     u = _clipped(fit.u + _clipped(p / A, -1.0, 1.0) * fit.s, -half, half)
@@ -159,7 +159,7 @@ def improve(y: F32, x: F32, weight: F32, fit: Fit, limit: F32) -> Fit:
     return Fit(*(values.astype(np.float32) for values in (u, s, A, b, information)))
 
 
-def _solved(normal: F64) -> tuple[F64, F64]:
+def solved(normal: F64) -> tuple[F64, F64]:
     """Solutions (n, N) of N symmetric systems, by elimination; and 1 / inverse[-1, -1] of each.
 
     Args:

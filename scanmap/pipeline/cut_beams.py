@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.pipeline.moving import move, per_column
 from scanmap.pipeline.step import Pipeline
 from scanmap.scan import Scan
-from scanmap.triangulation import locate
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -32,6 +32,7 @@ Mask = NDArray[np.bool_]
 
 # Bearings nearer to each other may be cut by the same edge, as a beam is no wider; farther ones are no neighbours.
 _AWAY, _FARTHEST = float(np.radians(0.4)), float(np.radians(15.0))
+TOGETHER = 12  # rows whose mean light and width are told first
 _ROWS, _FEWEST, _LONG = 31, 12, 24  # rows whose median tells light and width; how many must be known; least of a run
 _LIGHT, _WIDTH = 0.9, 0.93  # of the next bearing's, above which nothing was cut,
 _NARROW = 0.85  # and what most rows of a run are narrower than
@@ -57,8 +58,8 @@ class _Beside(NamedTuple):
 
 def put_back(
     scan: Scan, pipeline: Pipeline, light: Sequence[F32], width_px: Sequence[F32], asked: Collection[int]
-) -> int:
-    """Put lines of cut beams back in `scan`, in place, with their doubt in sigma; returns how many points moved.
+) -> Mask:
+    """Put lines of cut beams back in `scan`, in place, with their doubt in sigma; returns which cells (B, H) moved.
 
     Args:
         light: (H,) of each bearing: height times width of its line times the square of its range; NaN where clipped.
@@ -66,9 +67,9 @@ def put_back(
         asked: bearings of the scan, by their index, that count.
     """
     order = np.array(sorted(asked, key=lambda k: float(scan.bearings[k])), np.intp)
-    coarse = [_means(np.stack([own[k] for k in order])) for own in (light, width_px)] if len(order) else []
+    coarse = [means_along(np.stack([own[k] for k in order])) for own in (light, width_px)] if len(order) else []
     sides = _sides(scan.bearings[order])
-    count = 0
+    put = np.zeros((len(scan), scan.rows), bool)
     for side, opposite in (sides, sides[::-1]):
         some = np.flatnonzero(side.near >= 0)
         with np.errstate(invalid="ignore"):
@@ -78,15 +79,15 @@ def put_back(
             beside = _Beside(int(order[near]), int(order[far]), int(order[other]) if other >= 0 else None)
             k = int(order[place])
             for rows, foretold in _cut(scan, k, beside.near, light, width_px):
-                moved, slope = _off_plane(scan, pipeline, k, rows, beside)
+                moved = _off_plane(scan, pipeline, k, rows, beside)
                 if _LEAST <= abs(moved) / foretold <= _MOST:
-                    count += _move(scan, pipeline, k, rows, moved, slope)
-    return count
+                    put[k, move(scan, pipeline, k, rows, -moved, _UNKNOWN * abs(moved))] = True
+    return put
 
 
-def _means(values: F32) -> F32:
-    """Means (B, n) over 12 rows at a time of what is known of some values (B, H); NaN where nothing is."""
-    starts = np.arange(0, values.shape[1], _LONG // 2)
+def means_along(values: F32) -> F32:
+    """Means (B, n) over TOGETHER rows at a time of what is known of some values (B, H); NaN where nothing is."""
+    starts = np.arange(0, values.shape[1], TOGETHER)
     known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         sums = np.add.reduceat(np.where(known, values, np.float32(0.0)), starts, axis=1)
@@ -153,33 +154,28 @@ def _foretold(share: F64, narrow: F64, whole: F32) -> float:
     return float(np.nanmedian(whole)) * float(np.sqrt(min(beam, 1.0))) * m if beam < _SHEET else float("inf")
 
 
-def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Beside) -> tuple[float, F64]:
-    """How many columns the line of rows (N,) is off the plane of the bearings beside it; NaN where these have none.
-
-    And how far its points move with a column, (N, 3) in the head frame [m/px].
-    """
-    column, row = scan.column_px[k, rows].astype(np.float64), rows.astype(np.float64)
-    ends = [locate(column + half, row, pipeline.calibration, pipeline.triangulation)[0] for half in (0.5, -0.5)]
-    slope = ends[0] - ends[1]
+def _off_plane(scan: Scan, pipeline: Pipeline, k: int, rows: Index, beside: _Beside) -> float:
+    """How many columns the line of rows (N,) is off the plane of the bearings beside it; NaN where these have none."""
+    slope = per_column(pipeline, scan.column_px[k, rows].astype(np.float64), rows.astype(np.float64))
     points = np.concatenate([scan.points[one, rows] for one in (beside.near, beside.far)]).astype(np.float64)
     points = points[np.isfinite(points[:, 0])]
     if len(points) < 2 * _FEWEST:
-        return float("nan"), slope
+        return float("nan")
     for _ in range(_FITS):  # without what does not belong to it
         middle = points.mean(axis=0)
         normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
         rest = np.abs((points - middle) @ normal)
         points = points[rest <= _FAR_OFF * np.median(rest)]
-    per_column = slope @ scan.mount.T_world_head(float(scan.bearings[k]))[:3, :3].T @ normal
+    off_plane = slope @ scan.mount.T_world_head(float(scan.bearings[k]))[:3, :3].T @ normal
 
     def off(one: int) -> F64:
-        return np.asarray((scan.points[one, rows] - middle) @ normal / per_column, np.float64)
+        return np.asarray((scan.points[one, rows] - middle) @ normal / off_plane, np.float64)
 
     moved = float(np.nanmedian(off(k)))
-    flat = np.median(rest) < _FLAT_PX * np.nanmedian(np.abs(per_column))
+    flat = np.median(rest) < _FLAT_PX * np.nanmedian(np.abs(off_plane))
     if not flat or not _edge(scan, k, rows, beside, moved * _toward(scan, pipeline, k, rows, beside.near), off):
         moved = float("nan")
-    return moved, slope
+    return moved
 
 
 def _edge(scan: Scan, k: int, rows: Index, beside: _Beside, away: float, off: Callable[[int], F64]) -> bool:
@@ -208,19 +204,3 @@ def _toward(scan: Scan, pipeline: Pipeline, k: int, rows: Index, near: int) -> f
     places = np.stack([point, point + 1e-3 * aside]) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     before, after = pipeline.calibration.intrinsics.project(places)[:, 0]
     return float(np.sign(after - before))
-
-
-def _move(scan: Scan, pipeline: Pipeline, k: int, rows: Index, moved: float, slope: F64) -> int:
-    """Move the points of rows (N,) back by so many columns; returns how many."""
-    column = scan.column_px[k, rows] - moved
-    points = locate(column, rows.astype(np.float64), pipeline.calibration, pipeline.triangulation)[0]
-    range_m = np.sqrt(np.square(points).sum(axis=1))
-    with np.errstate(invalid="ignore"):
-        kept = range_m <= pipeline.triangulation.range_max_m
-    at = rows[kept]
-    T = scan.mount.T_world_head(float(scan.bearings[k]))
-    scan.points[k, at] = points[kept] @ T[:3, :3].T + T[:3, 3]
-    scan.range_m[k, at], scan.column_px[k, at] = range_m[kept], column[kept]
-    doubt = _UNKNOWN * abs(moved) * np.sqrt(np.square(slope[kept]).sum(axis=1))
-    scan.sigma_m[k, at] = np.hypot(scan.sigma_m[k, at], doubt)
-    return len(at)

@@ -8,15 +8,16 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import chain
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
 
 from scanmap.errors import CameraError
-from scanmap.pipeline.step import Pipeline, Sink, Step
+from scanmap.pipeline.step import Pipeline, Sink
 from scanmap.shot import Shot, decode_image
 
 _AHEAD = 3  # groups of shots that are read before the first is begun, where more than one make a group
+T = TypeVar("T")  # what is made of a shot
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
 
 
@@ -55,8 +56,8 @@ def checked(shots: Iterable[Shot], pipeline: Pipeline) -> Iterator[Shot]:
 
 def run(
     shots: Iterable[Shot],
-    process: Callable[[Shot], Step],
-    sinks: Iterable[Sink],
+    process: Callable[[Shot], T],
+    sinks: Iterable[Callable[[T], None]],
     stop: Callable[[], bool] = lambda: False,
     workers: int = 0,
 ) -> int:
@@ -66,7 +67,7 @@ def run(
         shots: the source; consumed in the caller's thread, a few shots ahead of the sinks, never more, so
             that memory does not grow with the number of frames.
         process: `Pipeline.process`; where there are many shots, `Processes.run` is the same on every core.
-        sinks: each called with every Step, in the caller's thread.
+        sinks: each called with every Step, or what else is made of a shot, in the caller's thread.
         stop: asked before each shot; True ends the loop after what was begun.
         workers: threads that call `process`; 0 takes one per processor core.
 
@@ -77,8 +78,8 @@ def run(
 
 def run_groups(
     shots: Iterable[Shot],
-    process: Callable[[list[Shot]], Iterable[Step]],
-    sinks: Iterable[Sink],
+    process: Callable[[list[Shot]], Iterable[T]],
+    sinks: Iterable[Callable[[T], None]],
     stop: Callable[[], bool],
     workers: int,
     together: int,
@@ -89,7 +90,7 @@ def run_groups(
     """
     workers = workers or os.cpu_count() or 1
     sinks = tuple(sinks)
-    pending: deque[Future[Iterable[Step]]] = deque()
+    pending: deque[Future[Iterable[T]]] = deque()
     ahead: deque[Shot] = deque()
     most_ahead = _AHEAD * together if together > 1 else 1
     done = 0

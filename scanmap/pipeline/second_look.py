@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import BLOCK, Reason, ridge_of
+from scanmap.pipeline.clean_flanks import by_clean_flanks
 from scanmap.pipeline.cut_beams import put_back
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.running import run
@@ -114,7 +115,12 @@ class SecondLook:
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
         if known.shown and total >= _HARD * scan.valid.sum():
             self._choose(scan, views, known._replace(choosing=True), shots)
-        put_back(scan, self._pipeline, self._reflectance, [shape[1] for shape in self._shape], asked)
+        widths = [shape[1] for shape in self._shape]
+        put = put_back(scan, self._pipeline, self._reflectance, widths, asked)
+        if shots is not None and asked:
+            whole = np.zeros_like(put)
+            whole[asked] = [np.isfinite(self._reflectance[k]) for k in asked]
+            by_clean_flanks(scan, self._pipeline, widths, whole & ~put, shots, self._keys)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:

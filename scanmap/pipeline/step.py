@@ -16,8 +16,10 @@ from scanmap.laserline import (
     Laser,
     LaserLine,
     LaserLineParams,
+    Moved,
     Reason,
     Rounding,
+    by_clean_flanks,
     laser_of,
     look,
     look_at_all,
@@ -27,6 +29,8 @@ from scanmap.laserline import (
 )
 from scanmap.shot import Decoded, Image, Shot, decode_image, is_grey
 from scanmap.triangulation import Profile, TriangulationParams, column_window, triangulate, triangulate_all
+
+F64 = NDArray[np.float64]
 
 
 class Step(NamedTuple):
@@ -136,6 +140,16 @@ class Pipeline:
         except CameraError:
             return None
         return ridges(image, self.laserline, self.laser)
+
+    def by_clean_flanks(self, shot: Shot, line: F64, usual: F64, asked: NDArray[np.bool_]) -> Moved | None:
+        """What `laserline.by_clean_flanks` says of a shot's line, arrays (H,); None where it cannot be read."""
+        try:
+            image = self._decode(shot.image, self._grey(shot.image)).image
+        except CameraError:
+            return None
+        dark, _ = self._background(shot)
+        own = self.laser if self.laserline.grey == "auto" else None
+        return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image))
 
     def _grey(self, data: bytes) -> bool:
         """Whether a picture's brightness is all that is asked for, or all there is of its channels."""

@@ -1,0 +1,126 @@
+"""Lines of which one side is another's are placed by the other side, once the sweep tells how wide a line is.
+
+How wide the line is depends on its range, and so on its column: the laser's sheet spreads, lenses blur. All bearings
+together tell it. Where a stretch of the line is narrower or wider than that its picture is read again, and the flank
+that is still a line's tells where it is (`laserline.by_clean_flanks`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanmap.laserline import ROWS, UNUSUAL, Moved
+from scanmap.pipeline.cut_beams import TOGETHER, means_along
+from scanmap.pipeline.moving import move
+from scanmap.pipeline.running import run
+from scanmap.pipeline.step import Pipeline
+from scanmap.scan import Scan
+from scanmap.shot import Shot
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Of lines by their columns, whose medians tell the usual width; lines of one, at least; lines in all that are enough.
+_GROUPS, _LEAST, _ENOUGH = 16, 400, 40_000
+_AROUND = ROWS // 2  # rows beside a stretch that are read with it
+_SOME = 0.7  # of what counts in ROWS rows, from which on in means of fewer they are asked
+
+
+def by_clean_flanks(
+    scan: Scan,
+    pipeline: Pipeline,
+    width_px: Sequence[F32],
+    asked: Mask,
+    shots: Callable[[], Iterable[Shot]],
+    keys: Sequence[tuple[float, float]],
+) -> int:
+    """Move points in `scan`, in place, whose line has one clean flank, with the doubt in sigma; returns how many.
+
+    Args:
+        width_px: (H,) of each bearing: standard deviation of the line's profile.
+        asked: (B, H) cells whose width counts.
+        shots: the shots of the scan once more.
+        keys: time and bearing of each bearing's shot.
+    """
+    usual = _Usual.of(scan.column_px, width_px, asked)
+    if usual is None:
+        return 0
+    odd: dict[int, Mask] = {}
+    places: dict[tuple[float, float], list[int]] = {}
+    for k in usual.doubtful(scan.column_px, width_px):
+        rows = usual.odd(scan.column_px[k], np.where(asked[k], width_px[k], np.nan))
+        if rows.any():
+            odd[k] = rows
+            places.setdefault(keys[k], []).append(k)
+
+    def wanted() -> Iterator[Shot]:
+        for shot in shots():
+            if (shot.time, shot.bearing) in places:
+                yield shot
+
+    def look(shot: Shot) -> tuple[Shot, Moved | None]:
+        k = places[shot.time, shot.bearing][0]
+        column = scan.column_px[k].astype(np.float64)
+        return shot, pipeline.by_clean_flanks(shot, column, usual.width(column), odd[k])
+
+    count = 0
+
+    def take(told: tuple[Shot, Moved | None]) -> None:
+        nonlocal count
+        shot, moved = told
+        if moved is None:
+            return
+        for k in places[shot.time, shot.bearing]:
+            rows = np.flatnonzero((moved.by != 0.0) & scan.valid[k])
+            count += len(move(scan, pipeline, k, rows, moved.by[rows], moved.doubt[rows]))
+
+    if places:
+        run(wanted(), look, [take])
+    return count
+
+
+class _Usual(NamedTuple):
+    """How wide lines usually are at a column."""
+
+    column: F64  # (G,) rising [px]
+    width_px: F64  # (G,)
+
+    @classmethod
+    def of(cls, column: F32, width_px: Sequence[F32], asked: Mask) -> _Usual | None:
+        """From lines at columns (B, H) and their widths, (H,) each, where `asked` (B, H); None of too few."""
+        every = max(1, int(asked.sum()) // _ENOUGH)
+        width = np.stack([own[::every] for own in width_px]) if len(width_px) else np.empty((0, 1), np.float32)
+        at = column[:, ::every]
+        known = asked[:, ::every] & np.isfinite(at) & np.isfinite(width)
+        at, width = at[known], width[known]
+        if len(at) < _LEAST:
+            return None
+        groups = np.array_split(np.argsort(at, kind="stable"), min(_GROUPS, len(at) // _LEAST))
+        return cls(*(np.array([np.median(values[some]) for some in groups], np.float64) for values in (at, width)))
+
+    def width(self, column: F32 | F64) -> F64:
+        """Usual widths at columns (...); NaN where there is none."""
+        return np.where(np.isfinite(column), np.interp(column, self.column, self.width_px), np.nan)
+
+    def doubtful(self, column: F32, width_px: Sequence[F32]) -> list[int]:
+        """Bearings in which a dozen rows are wider or narrower, of columns (B, H) and widths, (H,) each."""
+        width = means_along(np.stack(width_px))
+        rows = np.minimum(np.arange(width.shape[1]) * TOGETHER + TOGETHER // 2, column.shape[1] - 1)
+        with np.errstate(invalid="ignore"):
+            ratio = np.log(width / self.width(column[:, rows]))
+        return np.flatnonzero((np.abs(ratio) > _SOME * UNUSUAL).any(axis=1)).tolist()
+
+    def odd(self, column: F32, width: F32) -> Mask:
+        """Rows (H,) in and around stretches that are wider or narrower."""
+        with np.errstate(invalid="ignore"):
+            ratio = np.log(width / self.width(column))
+        known = np.isfinite(ratio)
+        mean = cv2.blur(np.where(known, ratio, 0.0)[None], (ROWS, 1), borderType=cv2.BORDER_CONSTANT)
+        odd = (np.abs(mean) > UNUSUAL).astype(np.uint8)
+        return np.asarray(cv2.dilate(odd, np.ones((1, 2 * _AROUND + 1), np.uint8))[0], bool) & known
