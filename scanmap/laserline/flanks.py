@@ -31,7 +31,7 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 ROWS = 25  # over which what the fits leave is averaged
-UNUSUAL = 0.1  # logarithm of a line's width over the usual one, in their mean, from which on its sides are asked
+UNUSUAL = 0.06  # logarithm of a line's width over the usual one, in their mean, from which on its sides are asked
 _HALF = 20  # [px] of the window
 _X = np.arange(-_HALF, _HALF + 1, dtype=np.float32)[:, None]
 _MARGIN = 160  # [px] beside the line that are looked at: they tell the noise, and the exposure of a laser-off frame
@@ -45,6 +45,7 @@ _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same o
 # noise; of a clean flank at most, where the line is wide and where it is narrow; how many times that of the other
 # flank, at least where the line is wide, and to settle it where the line is narrow.
 _ODD, _ODD_NOISE = 0.02, 0.8
+_BOTH = 0.003  # that times UNUSUAL's, at least: what textures and compression do is seldom much of either
 _CLEAN_WIDE, _CLEAN_NARROW, _CLEARLY, _SETTLED = 0.011, 0.009, 2.5, 4.0
 _LOPSIDED = 0.3  # else, of how far both flanks lie from a narrow line, their sum at least
 _FARTHEST_WIDE, _FARTHEST_NARROW, _OTHER = 1.2, 0.65, 1.9  # [usual widths] from the line: the clean flank, the other
@@ -147,7 +148,8 @@ def _uneven(lines: _Lines) -> Mask:
     rest = _mean(lines.rest)
     odd = np.sqrt(np.square(0.5 * (rest - rest[::-1])).mean(axis=0))
     least = np.maximum(np.float32(_ODD), np.float32(_ODD_NOISE) * _mean(lines.noise))
-    return np.asarray((np.abs(_mean(lines.ratio)) > UNUSUAL) & (odd > least))
+    unusual = np.abs(_mean(lines.ratio))
+    return np.asarray((unusual > UNUSUAL) & (odd > least) & (unusual * odd > _BOTH))
 
 
 def _told(lines: _Lines) -> F32:
