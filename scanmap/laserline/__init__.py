@@ -1,17 +1,20 @@
 """Image (+ background) to `LaserLine`: one sub-pixel column per row."""
 
 from scanmap.laserline.candidates import BLOCK
-from scanmap.laserline.flanks import ROWS, UNUSUAL, Moved, by_clean_flanks
+from scanmap.laserline.flanks import BOTH, ODD, ROWS, UNUSUAL, Moved, by_clean_flanks
 from scanmap.laserline.grey import binary_image, overlay, to_grey
 from scanmap.laserline.line import find_laser_line, laser_of, look, look_at_all
 from scanmap.laserline.params import LaserLineParams, needs_colour
-from scanmap.laserline.result import LaserLine, Look, Reason
+from scanmap.laserline.result import MEAN_ROWS, LaserLine, Look, Reason, means_along
 from scanmap.laserline.ridges import ridge_of, ridges
 from scanmap.laserline.rounding import Rounding, rounding_of
 from scanmap.laserline.sight import Laser
 
 __all__ = [
     "BLOCK",
+    "BOTH",
+    "MEAN_ROWS",
+    "ODD",
     "ROWS",
     "UNUSUAL",
     "Laser",
@@ -27,6 +30,7 @@ __all__ = [
     "laser_of",
     "look",
     "look_at_all",
+    "means_along",
     "needs_colour",
     "overlay",
     "ridge_of",

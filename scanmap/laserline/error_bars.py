@@ -38,20 +38,21 @@ class Doubts(NamedTuple):
 
     edges: Edges  # (N,) of the room's brightness
     plain: NDArray[np.bool_]  # (N,) whether nothing else but noise is known to move the line
+    lean: F32  # (N,) of their profiles, as `Peaks` has it
 
     @property
     def each(self) -> tuple[NDArray[np.generic], ...]:
         """All of them, arrays (N,)."""
-        return *self.edges, self.plain
+        return *self.edges, self.plain, self.lean
 
     def of(self, some: slice) -> Doubts:
         """Of some of the rows."""
-        return Doubts(Edges(self.edges.shift[some], self.edges.doubt[some]), self.plain[some])
+        return Doubts(Edges(self.edges.shift[some], self.edges.doubt[some]), self.plain[some], self.lean[some])
 
 
 def no_doubts(rows: int) -> Doubts:
     """Of so many rows, nothing yet."""
-    return Doubts(no_edges(rows), np.zeros(rows, bool))
+    return Doubts(no_edges(rows), np.zeros(rows, bool), np.zeros(rows, np.float32))
 
 
 def with_error_bars(line: LaserLine, sight: Sight, rows: int, doubts: Doubts) -> LaserLine:

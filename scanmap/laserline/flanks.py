@@ -44,8 +44,8 @@ _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same o
 # What is left over, rms in heights of the line: of the odd part of a whole line, at least, by itself and in a sample's
 # noise; of a clean flank at most, where the line is wide and where it is narrow; how many times that of the other
 # flank, at least where the line is wide, and to settle it where the line is narrow.
-_ODD, _ODD_NOISE = 0.02, 0.8
-_BOTH = 0.003  # that times UNUSUAL's, at least: what textures and compression do is seldom much of either
+ODD, _ODD_NOISE = 0.02, 0.8
+BOTH = 0.003  # that times UNUSUAL's, at least: what textures and compression do is seldom much of either
 _CLEAN_WIDE, _CLEAN_NARROW, _CLEARLY, _SETTLED = 0.011, 0.009, 2.5, 4.0
 _LOPSIDED = 0.3  # else, of how far both flanks lie from a narrow line, their sum at least
 _FARTHEST_WIDE, _FARTHEST_NARROW, _OTHER = 1.2, 0.65, 1.9  # [usual widths] from the line: the clean flank, the other
@@ -147,9 +147,9 @@ def _uneven(lines: _Lines) -> Mask:
     """Which lines (N,) are not as wide as usual, and not alike on both sides, in means along them."""
     rest = _mean(lines.rest)
     odd = np.sqrt(np.square(0.5 * (rest - rest[::-1])).mean(axis=0))
-    least = np.maximum(np.float32(_ODD), np.float32(_ODD_NOISE) * _mean(lines.noise))
+    least = np.maximum(np.float32(ODD), np.float32(_ODD_NOISE) * _mean(lines.noise))
     unusual = np.abs(_mean(lines.ratio))
-    return np.asarray((unusual > UNUSUAL) & (odd > least) & (unusual * odd > _BOTH))
+    return np.asarray((unusual > UNUSUAL) & (odd > least) & (unusual * odd > BOTH))
 
 
 def _told(lines: _Lines) -> F32:

@@ -26,7 +26,7 @@ from scanmap.laserline.onward import gaps_in, goes_on
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, fit_gaussian, judged
-from scanmap.laserline.result import LaserLine, Look, Reason, no_line, without
+from scanmap.laserline.result import LaserLine, Look, Reason, means_along, no_line, without
 from scanmap.laserline.rivals import contested
 from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
@@ -177,10 +177,11 @@ def _look(
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
     sight = sight_of(image, background, how, height, channel, roundings, noises)
     course = search(sight, window - left, params.min_snr, still)
-    lines = _found(sight, course, params, windows - left, still)
+    lines, lean = _found(sight, course, params, windows - left, still)
     lines.column_px[:] += left
     places = [own + np.float32(left) for own in course.places]
-    return [Look(line, own) for line, own in zip(_each(lines, height), places, strict=True)]
+    means = means_along(lean.reshape(pictures, height))
+    return [Look(*each) for each in zip(_each(lines, height), places, means, strict=True)]
 
 
 def _each(lines: LaserLine, height: int) -> list[LaserLine]:
@@ -190,7 +191,10 @@ def _each(lines: LaserLine, height: int) -> list[LaserLine]:
     return [LaserLine(column[k], peak[k], width[k], sigma[k], reason[k]) for k in own]
 
 
-def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array, still: Mask | None) -> LaserLine:
+def _found(
+    sight: Sight, course: Course, params: LaserLineParams, window: Array, still: Mask | None
+) -> tuple[LaserLine, F32]:
+    """The lines of pictures, and how much each row of their profiles leans, arrays (P H,)."""
     noise, height = sight.noise, sight.height
     row, column = columns_of_rows(sight.lit, course.column, window, noise)
     line, doubts = _located(sight, (row, column), params)
@@ -224,7 +228,7 @@ def _found(sight: Sight, course: Course, params: LaserLineParams, window: Array,
     fewest = _FEWEST_ROWS[sight.off is None]
     line = without(line, runs.crumbs(line.column_px, weak, height, fewest=fewest), Reason.AMBIGUOUS)
     line.column_px[:] += doubts.edges.shift
-    return with_error_bars(line, sight, params.pool_rows, doubts)
+    return with_error_bars(line, sight, params.pool_rows, doubts), doubts.lean
 
 
 def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> tuple[LaserLine, Doubts]:
@@ -276,6 +280,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         line.sigma_px[at_good] = np.maximum(total_sigma[k], _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
         doubts.edges.shift[at_good], doubts.edges.doubt[at_good] = own.shift[k], own.doubt[k]
+        doubts.lean[at_good] = peaks.lean[k]
         doubts.plain[at_good] = (peaks.bias_px[k] == 0.0) & ~peaks.clipped[k]
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]

@@ -53,7 +53,8 @@ class Peaks(NamedTuple):
     width_px: F32  # standard deviation of the profile
     height: F32  # above the background [grey levels]
     noise: F32  # standard deviation of a sample [grey levels]
-    bias_px: F32  # what an odd residual, larger than noise explains, may have moved offset_px by
+    lean: F32  # how much an odd part of the profile is of its height, and to which side
+    bias_px: F32  # what that, where it is larger than noise explains, may have moved offset_px by
     clipped: NDArray[np.bool_]  # the core is saturated
     one_sided: NDArray[np.bool_]  # nothing usable on one of the two flanks
     contrast: F64  # (P,) of each picture's speckle
@@ -174,15 +175,16 @@ def _peaks(
     odd -= np.float32(1.5)
     odd *= slope  # orthogonal to the derivative by u over the whole line
     power = np.maximum(dot(odd, odd), np.float32(1e-6))
-    asymmetry, uncertain = np.abs(dot(odd, look.residual)) / power / A, np.sqrt(variance / power) / A
-    bias = np.float32(0.5) * fit.s * np.maximum(asymmetry - np.float32(0.05) - np.float32(2.5) * uncertain, 0.0)
+    lean = np.asarray(dot(odd, look.residual) / power / A, np.float32)
+    uncertain = np.sqrt(variance / power) / A
+    bias = np.float32(0.5) * fit.s * np.maximum(np.abs(lean) - np.float32(0.05) - np.float32(2.5) * uncertain, 0.0)
     one_sided = np.zeros(len(fit.u), bool)
     if cut.size:
         # What each flank adds to the knowledge of u.
         flanks = slope.take(cut, axis=1)
         left, right = -np.minimum(flanks, 0.0).sum(axis=0), np.maximum(flanks, 0.0).sum(axis=0)
         one_sided[cut] = np.minimum(left, right) < _FLANK_SHARE * np.maximum(left, right)
-    return Peaks(fit.u, sigma, fit.s, A, np.sqrt(variance), bias, clipped, one_sided, np.zeros(0))
+    return Peaks(fit.u, sigma, fit.s, A, np.sqrt(variance), lean, bias, clipped, one_sided, np.zeros(0))
 
 
 def _fit_speckle(y: F32, x: F32, usable: F32, fit: Fit, rows: Rows, contrasts: F64, limit: F32) -> tuple[Fit, F32]:

@@ -53,6 +53,9 @@ _WORDS = {
 }
 
 
+MEAN_ROWS = 12  # rows of a line whose means are asked first
+
+
 class LaserLine(NamedTuple):
     """Laser line of one shot. Arrays of length H, the image's rows; NaN where a row has no line."""
 
@@ -70,6 +73,17 @@ class Look(NamedTuple):
     # (ceil(H / 8), n) [px] line-like places in every other block of 4 rows, NaN where there are fewer; None where none
     # were looked for.
     places: NDArray[np.float32] | None = None
+    # (ceil(H / MEAN_ROWS),) how much the line's profile leans, in heights of it: means along it; None as above.
+    lean: NDArray[np.float32] | None = None
+
+
+def means_along(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means (..., ceil(H / MEAN_ROWS)) along lines of what is known of some values (..., H); NaN where nothing is."""
+    starts = np.arange(0, values.shape[-1], MEAN_ROWS)
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        sums = np.add.reduceat(np.where(known, values, np.float32(0.0)), starts, axis=-1)
+        return np.asarray(sums / np.add.reduceat(known, starts, axis=-1, dtype=np.float32), np.float32)
 
 
 def no_line(height: int, reason: Reason) -> LaserLine:

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline import ROWS, UNUSUAL, Moved
-from scanmap.pipeline.cut_beams import TOGETHER, means_along
+from scanmap.laserline import BOTH, MEAN_ROWS, ODD, ROWS, UNUSUAL, Moved, means_along
 from scanmap.pipeline.moving import move
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline
@@ -30,12 +29,14 @@ Mask = NDArray[np.bool_]
 _GROUPS, _LEAST, _ENOUGH = 16, 400, 40_000
 _AROUND = ROWS // 2  # rows beside a stretch that are read with it
 _SOME = 0.7  # of what counts in ROWS rows, from which on in means of fewer they are asked
+_ODD_OF_LEAN = 0.45  # rms of (z^2 - 1.5) z exp(-z^2 / 2), in which the lean is told, at the places asked
 
 
 def by_clean_flanks(
     scan: Scan,
     pipeline: Pipeline,
     width_px: Sequence[F32],
+    lean: Sequence[F32 | None],
     asked: Mask,
     shots: Callable[[], Iterable[Shot]],
     keys: Sequence[tuple[float, float]],
@@ -44,6 +45,7 @@ def by_clean_flanks(
 
     Args:
         width_px: (H,) of each bearing: standard deviation of the line's profile.
+        lean: of each bearing, how much the profile leans, as `Look` has it.
         asked: (B, H) cells whose width counts.
         shots: the shots of the scan once more.
         keys: time and bearing of each bearing's shot.
@@ -53,7 +55,7 @@ def by_clean_flanks(
         return 0
     odd: dict[int, Mask] = {}
     places: dict[tuple[float, float], list[int]] = {}
-    for k in usual.doubtful(scan.column_px, width_px):
+    for k in usual.doubtful(scan.column_px, width_px, lean):
         rows = usual.odd(scan.column_px[k], np.where(asked[k], width_px[k], np.nan))
         if rows.any():
             odd[k] = rows
@@ -108,13 +110,16 @@ class _Usual(NamedTuple):
         """Usual widths at columns (...); NaN where there is none."""
         return np.where(np.isfinite(column), np.interp(column, self.column, self.width_px), np.nan)
 
-    def doubtful(self, column: F32, width_px: Sequence[F32]) -> list[int]:
-        """Bearings in which a dozen rows are wider or narrower, of columns (B, H) and widths, (H,) each."""
+    def doubtful(self, column: F32, width_px: Sequence[F32], lean: Sequence[F32 | None]) -> list[int]:
+        """Bearings in which some rows are wider or narrower, and lean, of columns (B, H) and widths, (H,) each."""
         width = means_along(np.stack(width_px))
-        rows = np.minimum(np.arange(width.shape[1]) * TOGETHER + TOGETHER // 2, column.shape[1] - 1)
+        rows = np.minimum(np.arange(width.shape[1]) * MEAN_ROWS + MEAN_ROWS // 2, column.shape[1] - 1)
+        unknown = np.full(width.shape[1], np.nan, np.float32)
         with np.errstate(invalid="ignore"):
-            ratio = np.log(width / self.width(column[:, rows]))
-        return np.flatnonzero((np.abs(ratio) > _SOME * UNUSUAL).any(axis=1)).tolist()
+            unusual = np.abs(np.log(width / self.width(column[:, rows])))
+            odd = _ODD_OF_LEAN * np.abs(np.stack([unknown if own is None else own for own in lean]))
+            doubtful = (unusual > _SOME * UNUSUAL) & (odd > _SOME * ODD) & (unusual * odd > _SOME * BOTH)
+        return np.flatnonzero(doubtful.any(axis=1)).tolist()
 
     def odd(self, column: F32, width: F32) -> Mask:
         """Rows (H,) in and around stretches that are wider or narrower."""

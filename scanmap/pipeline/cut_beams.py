@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanmap.laserline import means_along
 from scanmap.pipeline.moving import move, per_column
 from scanmap.pipeline.step import Pipeline
 from scanmap.scan import Scan
@@ -32,7 +33,6 @@ Mask = NDArray[np.bool_]
 
 # Bearings nearer to each other may be cut by the same edge, as a beam is no wider; farther ones are no neighbours.
 _AWAY, _FARTHEST = float(np.radians(0.4)), float(np.radians(15.0))
-TOGETHER = 12  # rows whose mean light and width are told first
 _ROWS, _FEWEST, _LONG = 31, 12, 24  # rows whose median tells light and width; how many must be known; least of a run
 _LIGHT, _WIDTH = 0.9, 0.93  # of the next bearing's, above which nothing was cut,
 _NARROW = 0.85  # and what most rows of a run are narrower than
@@ -83,15 +83,6 @@ def put_back(
                 if _LEAST <= abs(moved) / foretold <= _MOST:
                     put[k, move(scan, pipeline, k, rows, -moved, _UNKNOWN * abs(moved))] = True
     return put
-
-
-def means_along(values: F32) -> F32:
-    """Means (B, n) over TOGETHER rows at a time of what is known of some values (B, H); NaN where nothing is."""
-    starts = np.arange(0, values.shape[1], TOGETHER)
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        sums = np.add.reduceat(np.where(known, values, np.float32(0.0)), starts, axis=1)
-        return np.asarray(sums / np.add.reduceat(known, starts, axis=1, dtype=np.float32), np.float32)
 
 
 class _Side(NamedTuple):

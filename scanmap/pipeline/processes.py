@@ -49,6 +49,7 @@ class Answer(NamedTuple):
     profile: Profile | None = None
     fault: str = ""
     places: NDArray[np.float32] | None = None
+    lean: NDArray[np.float32] | None = None
     error: Exception | None = None
 
 
@@ -136,7 +137,7 @@ def _steps(shots: list[Shot], answers: list[Answer]) -> Iterator[Step]:
     for shot, answer in zip(shots, answers, strict=True):
         if answer.line is None or answer.profile is None:
             raise answer.error or RuntimeError("a worker process answered nothing")
-        yield Step(shot, answer.line, answer.profile, answer.fault, answer.places)
+        yield Step(shot, answer.line, answer.profile, answer.fault, answer.places, answer.lean)
 
 
 class _Worker:

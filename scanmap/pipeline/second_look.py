@@ -73,6 +73,7 @@ class SecondLook:
         self._keys: list[tuple[float, float]] = []
         self._reflectance: list[F32] = []
         self._shape: list[F32] = []  # (2, H) height and width of the lines
+        self._lean: list[F32 | None] = []
         self._places: list[F32 | None] = []  # of pictures without laser-off frames: what does not change is gone there
         self._listed_in: list[F32 | None] = []
         self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
@@ -85,6 +86,7 @@ class SecondLook:
         places = None if step.fault else step.places
         self._places.append(places if step.shot.background is None else None)
         self._listed_in.append(places)
+        self._lean.append(step.lean)
 
     def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
@@ -120,7 +122,7 @@ class SecondLook:
         if shots is not None and asked:
             whole = np.zeros_like(put)
             whole[asked] = [np.isfinite(self._reflectance[k]) for k in asked]
-            by_clean_flanks(scan, self._pipeline, widths, whole & ~put, shots, self._keys)
+            by_clean_flanks(scan, self._pipeline, widths, self._lean, whole & ~put, shots, self._keys)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:

@@ -41,6 +41,7 @@ class Step(NamedTuple):
     profile: Profile  # (H,) head frame
     fault: str = ""  # what was wrong with the image; empty when nothing was
     places: NDArray[np.float32] | None = None  # all that looks like a line, as `Look` has it
+    lean: NDArray[np.float32] | None = None  # of the line, as that has it
 
 
 Sink = Callable[[Step], None]
@@ -88,7 +89,9 @@ class Pipeline:
         found = look(image.image, self.laserline, dark, self.window, still, self.laser, rounding_of(shot.image))
         line, cut = _cut(found.line, image.rows_valid)
         fault = "; ".join(each for each in (cut, lacks) if each)
-        return Step(shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places)
+        return Step(
+            shot, line, triangulate(line, self.calibration, self.triangulation), fault, found.places, found.lean
+        )
 
     def process_all(self, shots: Sequence[Shot]) -> list[Step]:
         """What `process` gives for each of the shots, bit for bit, sooner."""
@@ -122,7 +125,7 @@ class Pipeline:
                 steps.append(self._blind(shot, faults[k]))
             else:
                 (line, fault), profile, found = next(seen)
-                steps.append(Step(shot, line, profile, fault, found.places))
+                steps.append(Step(shot, line, profile, fault, found.places, found.lean))
         return steps
 
     def ask_laser(self, shot: Shot) -> bool:
