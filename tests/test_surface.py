@@ -143,6 +143,25 @@ def test_what_is_removed_says_so_and_the_rest_is_untouched():
     np.testing.assert_array_equal(clean.points[~cells], noisy.points[~cells])
 
 
+def test_points_that_say_next_to_nothing_go_and_hold_nothing_up():
+    scan = box_scan(HALF_TURN, 120, sigma_px=0.02)
+    vague = np.zeros(scan.valid.shape, bool)
+    vague[20:24, 30:50] = True
+    fields = {name: getattr(scan, name).copy() for name in FIELDS}
+    fields["sigma_m"][vague] = 0.06 * fields["range_m"][vague]
+    told = Scan.from_arrays(scan.mount, scan.bearings.copy(), fields, scan.comments)
+    # A speck between two of them: they are so unsure that it would lie on their surface.
+    cells = np.zeros(scan.valid.shape, bool)
+    cells[21, 40] = True
+    told.sigma_m[cells] = 1e-4
+    told = stretched(told, cells, 0.8)
+    clean = remove_outliers(told)
+    assert (clean.reason[vague & ~cells] == Reason.WEAK).all()
+    assert clean.reason[21, 40] == Reason.OUTLIER
+    assert not lost(scan, clean)[~vague].any()
+    assert not lost(told, remove_outliers(told, ScanParams(max_sigma_share=0.07)))[vague & ~cells].any()
+
+
 def test_a_scan_without_points_or_with_one_bearing_passes():
     for scan in (box_scan(HALF_TURN[:0], 20), box_scan(HALF_TURN[:1], 20), box_scan(HALF_TURN[:2], 20, range_max=0.01)):
         assert len(remove_outliers(scan)) == len(scan)

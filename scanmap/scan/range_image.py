@@ -25,6 +25,9 @@ class ScanParams(BaseModel, frozen=True, extra="forbid"):
     )
     mirrors: bool = Field(True, description="remove points seen in mirrors on walls, where the scan itself proves them")
     filter_outliers: bool = Field(True, description="remove points that no neighbour in the range image supports")
+    max_sigma_share: float = Field(
+        0.05, gt=0, le=1, description="outliers, too: points whose sigma is more than this share of their range"
+    )
     merge_deg: float = Field(0.02, ge=0, description="bearings closer than this are one column [deg]")
     support_px: float = Field(
         0.25, ge=0, le=20, description="neighbours this close in the image are one surface, beside their noise [px]"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import Reason
-from scanmap.scan.links import Disparity, bearing_links, blocks, depth_edge_slope, disparity, row_links
+from scanmap.scan.links import MAX_GAP, Disparity, bearing_links, blocks, depth_edge_slope, disparity, row_links
 from scanmap.scan.range_image import Scan, ScanParams
 
 F32 = NDArray[np.float32]
@@ -20,10 +20,17 @@ Mask = NDArray[np.bool_]
 def remove_outliers(scan: Scan, params: ScanParams | None = None) -> Scan:
     """A copy without the points that no neighbour supports (`Reason.OUTLIER`).
 
+    And without those that say next to nothing of where the surface is, `max_sigma_share` (`Reason.WEAK`); what lies so
+    far off may be anything's neighbour.
+
     A point stays if the row above or below lies on the same surface. If both rows are there and neither does, the
     bearings decide: a wire along them stays, a speck does not, nor a flying pixel that hangs between two surfaces.
     """
-    return scan.without(unsupported(scan, params or ScanParams()), Reason.OUTLIER)
+    params = params or ScanParams()
+    with np.errstate(invalid="ignore"):
+        known = scan.without(scan.sigma_m > params.max_sigma_share * scan.range_m, Reason.WEAK)
+    known.give_up(unsupported(known, params), Reason.OUTLIER)
+    return known
 
 
 def unsupported(scan: Scan, params: ScanParams) -> Mask:
@@ -35,7 +42,12 @@ def unsupported(scan: Scan, params: ScanParams) -> Mask:
         core = slice(block.start + halo, block.stop + halo)
         rows = row_links(d, core, reach)
         alone = np.isfinite(d.q[core])
+        lost = ~alone[:, 1:-1]
+        # What a gap carries on is linked to where it comes from; a neighbour is only the point at its end.
+        rows &= alone[:, 1:]
         alone[:, 1:] &= ~rows
+        for _ in range(MAX_GAP):
+            rows[:, :-1] |= lost & rows[:, 1:]
         alone[:, :-1] &= ~rows
         lonely[block] = alone
     column, row = np.nonzero(lonely)
