@@ -1,8 +1,7 @@
 """A second look at the pictures in which something else was taken for the laser line, once the sweep is known.
 
 Two things are known after a sweep that no picture knows of itself: what stands still (`still`), and how bright surfaces
-are in the laser's light. Light and width of a line, times the square of its range, are what the surface reflects: 400
-times less than the usual surface of this scan is less than black paint seen at a grazing angle.
+are in the laser's light (`reflectance`).
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.clean_flanks import by_clean_flanks
 from scanmap.pipeline.cut_beams import put_back
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
+from scanmap.pipeline.reflectance import Usual, reflectance
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
@@ -36,9 +36,6 @@ Shots = Callable[[], Iterable[Shot]]
 _TURNS = 3  # at first many of the neighbours are as wrong; after that they are asked
 _LOOKS = 3  # each may show what was hidden behind the last
 _LEAST_ROWS = 8  # of a picture that are worth another look
-# Of the usual reflectance: what no surface has, and hardly one that no neighbouring bearing goes on to (in 22 drawn
-# sweeps 2 of 620,000 true points, and 258 false ones); grey levels up to which a height says how bright a line is.
-_DIM, _DIM_ALONE, _UNCLIPPED = 0.0025, 0.01, 200.0
 # Share of points that were another thing's, from which on the line itself is looked for once more, in pictures that
 # have so many rows without a point though a place is listed where it should be.
 _HARD, _WORTH_ROWS = 0.01, 24
@@ -57,7 +54,7 @@ class _Known(NamedTuple):
     still: StillThings
     shown: bool  # whether that comes from all that the pictures show, or what was listed
     neighbours: Neighbours | None  # None at first
-    usual: float  # reflectance
+    usual: Usual
     choosing: bool = False  # whether only what goes on from the neighbours is wanted
 
     def share(self, k: int, range_m: F32 | F64) -> F64:
@@ -81,7 +78,7 @@ class SecondLook:
     def __call__(self, step: Step) -> None:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
         self._keys.append((step.shot.time, step.shot.bearing))
-        self._reflectance.append(_reflectance(step))
+        self._reflectance.append(reflectance(step))
         self._shape.append(np.array([step.line.peak, step.line.width_px], np.float32))
         places = None if step.fault else step.places
         self._places.append(places if step.shot.background is None else None)
@@ -100,7 +97,8 @@ class SecondLook:
         """
         asked = [k for k in range(len(scan)) if k not in without]
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
-        known, total = _Known(self._listed(scan, views), False, None, self._usual()), 0
+        usual = Usual.of(self._reflectance, self._shape)
+        known, total = _Known(self._listed(scan, views), False, None, usual), 0
         for _ in range(_TURNS):
             # Most scans of plain rooms need not be read again, nor asked more.
             suspect = shots is None or known.shown or self._suspected(scan, views, known)
@@ -141,9 +139,8 @@ class SecondLook:
         """The cells (B, H) that show another thing than the line."""
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
-            with np.errstate(invalid="ignore"):
-                wrong[k] = self._reflectance[k] < _DIM * known.usual
-                dim = self._reflectance[k] < _DIM_ALONE * known.usual
+            wrong[k] = known.usual.nothing(self._reflectance[k])
+            dim = known.usual.strange(self._reflectance[k], self._shape[k], scan.range_m[k])
             if known.neighbours is not None and dim.any():
                 wrong[k] |= dim & known.neighbours.alone(k, scan.range_m[k])
         for k in views:
@@ -192,12 +189,6 @@ class SecondLook:
         goes_on, elsewhere = known.neighbours.tell(k, np.sqrt((points**2).sum(axis=1)).reshape(column.shape))
         off = np.where((goes_on == 0) & (elsewhere > 0), column, np.nan).astype(np.float32)
         return ~scan.valid[k] & (goes_on > 0).any(axis=1), list(off.T)
-
-    def _usual(self) -> float:
-        known = np.concatenate(
-            [values[np.isfinite(values)][::4] for values in self._reflectance] or [np.empty(0, np.float32)]
-        )
-        return float(np.median(known)) if known.size else 0.0
 
     def _shown(self, views: list[int], shots: Iterable[Shot]) -> StillThings:
         """What the pictures of some bearings show, read once more."""
@@ -257,7 +248,7 @@ class SecondLook:
             for k in places[step.shot.time, step.shot.bearing]:
                 new = ~scan.valid[k] & (step.profile.reason == Reason.OK)
                 scan.amend(k, new, step.profile)
-                self._reflectance[k][new] = _reflectance(step)[new]
+                self._reflectance[k][new] = reflectance(step)[new]
                 self._shape[k][:, new] = step.line.peak[new], step.line.width_px[new]
 
         run(wanted(), look, [take])
@@ -279,16 +270,8 @@ def _other(step: Step, k: int, known: _Known, ridges: U8 | None) -> Mask:
     other = known.still.line(step.shot.bearing, line.column_px, ridge, share)
     if known.choosing:
         other |= share < SHARE
-    with np.errstate(invalid="ignore"):
-        other |= _reflectance(step) < _DIM * known.usual
+    other |= known.usual.nothing(reflectance(step))
     return other if ridges is None else other | _hidden(line.column_px, ridge, ridges)
-
-
-def _reflectance(step: Step) -> F32:
-    """Light of the line (H,) times the square of its range, NaN where it is clipped or there is none."""
-    with np.errstate(invalid="ignore"):
-        light = np.where(step.line.peak < _UNCLIPPED, step.line.peak * step.line.width_px, np.nan)
-        return (light * step.profile.range_m**2).astype(np.float32)
 
 
 def _hidden(column: F64, ridge: F64, ridges: U8) -> Mask:
