@@ -121,7 +121,7 @@ def test_pictures_of_another_size_and_without_board_are_rejected_with_reasons() 
     found = collect([Picture("good", picture), Picture("empty", empty), Picture("large", large)], board)
     assert [view.name for view in found.views] == ["good"]
     assert [(each.name, each.reason) for each in found.rejected] == [
-        ("empty", "no board found"), ("large", "is 800x600, the others are 640x480"),
+        ("empty", "no board found"), ("large", "is 800x600, the first 640x480; leave out what another camera took"),
     ]  # fmt: skip
 
 

@@ -172,7 +172,10 @@ def _judged(
     if views.size == (0, 0):
         views.size = (width, height)
     if views.size != (width, height):
-        return Rejected(picture.name, f"is {width}x{height}, the others are {views.size[0]}x{views.size[1]}")
+        return Rejected(
+            picture.name,
+            f"is {width}x{height}, the first {views.size[0]}x{views.size[1]}; leave out what another camera took",
+        )
     seen = picture.image if picture.background is None else picture.background
     found = find_board(seen, views.board, picture.name, picture.bearing)
     if isinstance(found, Rejected):
