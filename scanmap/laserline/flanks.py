@@ -37,7 +37,9 @@ _X = np.arange(-_HALF, _HALF + 1, dtype=np.float32)[:, None]
 _MARGIN = 160  # [px] beside the line that are looked at: they tell the noise, and the exposure of a laser-off frame
 _CORE, _REACH, _LEVEL = 0.3, 3.4, 1.2  # [usual widths] where a flank begins and ends, and what it has of the level
 _STEPS = 8
-_SHORTEST = 15  # rows of a stretch
+_LEAST_PX = 1.2  # usual width; a flank of a thinner line has too few samples
+_SHORTEST, _SURE_SHARE = 15, 0.3  # rows of a stretch that are sure, and their share of it
+_STILL, _CLEAN_STILL = 0.04, 0.02  # of the others in it: how unusual they still are, and their clean flank's rest
 _JUMP_PX = 2.0  # between rows of different surfaces
 _PLACES = np.linspace(-3.0, 3.0, 13, dtype=np.float32)  # [widths] at which what is left of a line is compared
 _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same of a flank
@@ -114,7 +116,8 @@ def by_clean_flanks(
     """
     height = len(line)
     moved = Moved(np.zeros(height), np.zeros(height))
-    rows = np.flatnonzero(asked & np.isfinite(line) & np.isfinite(usual))
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero(asked & np.isfinite(line) & (usual > _LEAST_PX))
     if len(rows) < ROWS:
         return moved
     if background is not None:
@@ -167,10 +170,27 @@ def _told(lines: _Lines) -> F32:
     dimmed &= (np.abs(own) < _FARTHEST_NARROW * wide) & (np.abs(other) < _OTHER * wide)
     added = ~narrow & (left < _CLEAN_WIDE) & (clearer > _CLEARLY) & (np.abs(own) < _FARTHEST_WIDE * wide)
     even = np.abs(level[1] - level[0]) < np.float32(_LEVELS) * _mean(lines.whole.A)
-    believed = (_uneven(lines) & even & (dimmed | added)).astype(np.uint8)[None]
-    # A stretch that is shorter than what it was told from is chance.
-    long = cv2.morphologyEx(believed, cv2.MORPH_OPEN, np.ones((1, _SHORTEST), np.uint8), borderValue=0)
-    return np.where(long[0] > 0, own, np.float32(0.0))
+    sure = _uneven(lines) & even & (dimmed | added)
+    unusual = np.abs(_mean(lines.ratio)) > _STILL
+    by: F32 = np.zeros_like(own)
+    for side in (0, 1):
+        for kind, farthest in ((narrow, _FARTHEST_NARROW), (~narrow, _FARTHEST_WIDE)):
+            # Between rows that are sure the same goes on.
+            alike = unusual & kind & even & (rests[side] < rests[1 - side]) & (rests[side] < _CLEAN_STILL)
+            alike &= np.abs(off[side]) < farthest * wide
+            stretch = _around_sure(sure & kind & (clean == side), alike)
+            by[stretch] = off[side, stretch]
+    return by
+
+
+def _around_sure(sure: Mask, alike: Mask) -> Mask:
+    """Runs (N,) of rows that are sure or alike, of which enough, and a large enough part, are sure."""
+    some = sure | alike
+    run = np.cumsum(some & ~np.append(False, some[:-1])) * some
+    count, whole = np.bincount(run, sure), np.bincount(run)
+    kept = (count >= _SHORTEST) & (count >= _SURE_SHARE * whole)
+    kept[0] = False
+    return np.asarray(kept[run])
 
 
 def _flank(lines: _Lines, side: int) -> _Flank:

@@ -46,10 +46,14 @@ class Neighbours(NamedTuple):
             elsewhere += np.isfinite(theirs) & ~near
         return goes_on, elsewhere
 
-    def alone(self, k: int, range_m: F32 | F64) -> Mask:
-        """Which points (H,) of bearing `k`, at some ranges [m], no neighbour goes on to, though there is one."""
-        goes_on, _ = self.tell(k, range_m)
-        return np.asarray(goes_on == 0) if self.beside[k] else np.zeros(goes_on.shape, bool)
+    def alone(self, k: int, range_m: F32 | F64) -> tuple[Mask, Mask]:
+        """Which points (H,) of bearing `k`, at some ranges [m], no neighbour goes on to, though there is one.
+
+        And where besides one of them sees nothing at all.
+        """
+        goes_on, elsewhere = self.tell(k, range_m)
+        alone = np.asarray((goes_on == 0) & (len(self.beside[k]) > 0))
+        return alone, alone & (elsewhere < len(self.beside[k]))
 
     def share(self, k: int, range_m: F32 | F64) -> F64:
         """The share of other pictures that proves points (H,) of bearing `k`, at some ranges [m], to stand still."""

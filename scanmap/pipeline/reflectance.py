@@ -2,7 +2,8 @@
 
 Light and width of a line, times the square of its range, are what the surface reflects: 400 times less than the usual
 surface of a scan is less than black paint seen at a grazing angle. A mirror throws the line on what the camera sees
-straight: as bright as the things it falls on, and by its column something near and nearly black.
+straight: as bright as the things it falls on, and by its column something near and nearly black. So is a black rod
+before a wall; but on either side of a rod the wall is seen, and beside the other on one side at most.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ Mask = NDArray[np.bool_]
 # Of the usual reflectance: what no surface has, and hardly one that no neighbouring bearing goes on to (in 22 drawn
 # sweeps 2 of 620,000 true points, and 258 false ones); grey levels up to which a height says how bright a line is.
 _DIM, _DIM_ALONE, _UNCLIPPED = 0.0025, 0.01, 200.0
-# So little of the usual reflectance with at least so much of the usual light is no black thing near the scanner that
-# neighbours miss (in 16 drawn sweeps 341 false points, none true; 80 true ones of black chairs are 40 times darker).
+# So little of the usual reflectance with at least so much of the usual light, where a neighbour sees nothing: in 16
+# drawn sweeps 341 false points, and none true; 80 true ones of black chairs have a thirtieth of that light.
 _DIM_NEAR, _BRIGHT = 0.03, 0.15
 
 
@@ -49,17 +50,20 @@ class Usual(NamedTuple):
         with np.errstate(invalid="ignore"):
             return np.asarray(reflectances < _DIM * self.reflectance)
 
-    def strange(self, reflectances: F32, shape: F32, range_m: F32) -> Mask:
-        """Which lines (H,) no surface throws back that neighbours do not go on to.
+    def hardly(self, reflectances: F32) -> Mask:
+        """Which lines (H,) are darker than almost any surface."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(reflectances < _DIM_ALONE * self.reflectance)
+
+    def thrown(self, shape: F32, range_m: F32) -> Mask:
+        """Which lines (H,) are as bright as usual, and by their range [m] of something black.
 
         Args:
             shape: (2, H) their heights and widths.
-            range_m: (H,).
         """
         light = shape[0] * shape[1]
         with np.errstate(invalid="ignore"):
-            black_and_bright = (light * range_m**2 < _DIM_NEAR * self.reflectance) & (light > _BRIGHT * self.light)
-            return np.asarray(black_and_bright | (reflectances < _DIM_ALONE * self.reflectance))
+            return np.asarray((light * range_m**2 < _DIM_NEAR * self.reflectance) & (light > _BRIGHT * self.light))
 
 
 def _median(values: Sequence[F32]) -> float:

@@ -140,9 +140,11 @@ class SecondLook:
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
             wrong[k] = known.usual.nothing(self._reflectance[k])
-            dim = known.usual.strange(self._reflectance[k], self._shape[k], scan.range_m[k])
-            if known.neighbours is not None and dim.any():
-                wrong[k] |= dim & known.neighbours.alone(k, scan.range_m[k])
+            hardly = known.usual.hardly(self._reflectance[k])
+            thrown = known.usual.thrown(self._shape[k], scan.range_m[k])
+            if known.neighbours is not None and (hardly.any() or thrown.any()):
+                alone, beside_nothing = known.neighbours.alone(k, scan.range_m[k])
+                wrong[k] |= (hardly & alone) | (thrown & beside_nothing)
         for k in views:
             wrong[k] |= self._stands(scan, k, known)
         for k in _beside(scan.bearings, asked, views, [k for k in views if wrong[k].any()]):
