@@ -131,7 +131,7 @@ PANELS_Y = 1.7 + 0.13 * (3 * np.arange(11) % 5)
 JOINT = 5
 
 
-def swept(joint: int = JOINT, lost: int = -1) -> Scan:
+def swept(joint: int = JOINT, lost: int = -1, params: LaserLineParams = PARAMS) -> Scan:
     """A sweep of the panels after the second look; a joint runs along the line of one, a picture is lost before it."""
     calibration, shots = head(), []
     for k, bearing in enumerate(np.radians(np.arange(70.0, 111.0, 4.0))):
@@ -140,7 +140,7 @@ def swept(joint: int = JOINT, lost: int = -1) -> Scan:
         )
         image = bytes(cv2.imencode(".png", picture)[1])
         shots.append(Shot(k, float(bearing), float(bearing), float(k), image, None))
-    pipeline = Pipeline(calibration, PARAMS, TriangulationParams())
+    pipeline = Pipeline(calibration, params, TriangulationParams())
     scan, second = Scan(calibration.mount, HEIGHT), SecondLook(pipeline)
     run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second], workers=1)
     if lost >= 0:
@@ -170,3 +170,9 @@ def test_a_sweep_tells_the_usual_width_and_moves_the_points() -> None:
     T = scan.mount.T_world_head(float(scan.bearings[JOINT]))
     assert np.allclose(scan.points[JOINT, known], transform(T, own), atol=1e-5)
     assert np.allclose(scan.range_m[JOINT, known], np.linalg.norm(own, axis=1), atol=1e-5)
+
+
+def test_the_centre_of_gravity_stays_the_thesis_s() -> None:
+    params = PARAMS.model_copy(update={"method": "cog", "pool_rows": 1})
+    scan, again = swept(params=params), swept(lost=JOINT, params=params)
+    assert np.array_equal(scan.column_px, again.column_px, equal_nan=True)

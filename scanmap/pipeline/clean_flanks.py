@@ -49,8 +49,10 @@ def by_clean_flanks(
         asked: (B, H) cells whose width counts.
         shots: the shots of the scan once more.
         keys: time and bearing of each bearing's shot.
+
+    The thesis's ways to find the line stay as they are.
     """
-    usual = _Usual.of(scan.column_px, width_px, asked)
+    usual = _Usual.of(scan.column_px, width_px, asked) if pipeline.laserline.method == "gauss" else None
     if usual is None:
         return 0
     odd: dict[int, Mask] = {}

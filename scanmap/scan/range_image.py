@@ -21,7 +21,8 @@ class ScanParams(BaseModel, frozen=True, extra="forbid"):
     """What happens to the range image before it is written; `[scan]` in a rig's TOML."""
 
     second_look: bool = Field(
-        True, description="after the sweep, look again where a thing that stands still was taken for the line"
+        True,
+        description="after the sweep, look again where something else was taken for the line, or for one side of it",
     )
     mirrors: bool = Field(True, description="remove points seen in mirrors on walls, where the scan itself proves them")
     filter_outliers: bool = Field(True, description="remove points that no neighbour in the range image supports")
