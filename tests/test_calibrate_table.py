@@ -184,6 +184,7 @@ BAD = {
     "ppx,actual_m\n530,0.3\n600,-1\n": "line 3: distance -1; it must be above 0",
     "ppx,actual_m\n530,0.3,7,8\n": "4 cells under 2 headers",
     "actual_m\n0.3\n0.2\n0.1\n": "every row needs a column",
+    "ppx,actual_m\n100,0.3\nnan,0.2\n130,0.1\n": "row 2 has no column of the image",
     "ppx,actual_m\n530,0.3\n600,0.25\n": "too few; measure at 3 distances",
     "ppx,actual_m\n530,0.3\n600,0.25\n2000,0.2\n": "column 2000 is outside an image 1600 px wide; give --width",
     "ppx,actual_m\n530,0.3\n600,0.1\n698,0.2\n848,0.4\n": "do not follow the columns",

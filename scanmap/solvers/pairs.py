@@ -112,6 +112,11 @@ def check_fit(pairs: Pairs, path: Path, width: int, chosen: NDArray[np.intp]) ->
         ConfigError: no columns, or outside of the image.
         CalibrationError: too few pairs, or all at one place.
     """
+    known = np.isfinite(pairs.column)
+    if known.any() and not known.all():
+        raise ConfigError(
+            f"{path}: row {int(known.argmin()) + 1} has no column of the image; fill it in, or leave it out"
+        )
     if not pairs.has_columns:
         raise ConfigError(
             f"{path}: to fit a model every row needs a column of the image; valid headers: {', '.join(COLUMN_NAMES)}"
