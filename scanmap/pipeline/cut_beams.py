@@ -127,9 +127,12 @@ def _running_median(values: F64) -> F64:
     """Medians over _ROWS rows (H,) of what is known; NaN where that is little, and where the row itself is not."""
     known, result = np.isfinite(values), np.full(len(values), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, _ROWS // 2, constant_values=np.nan), _ROWS)
-    at = known & (np.isfinite(windows).sum(axis=1) >= _FEWEST)
-    if at.any():
-        result[at] = np.nanmedian(windows[at], axis=1)
+    count = np.isfinite(windows).sum(axis=1)
+    at = np.flatnonzero(known & (count >= _FEWEST))
+    # What is not known comes last; `nanmedian` takes four times as long.
+    ordered, count = np.sort(windows[at], axis=1), count[at]
+    each = np.arange(len(at))
+    result[at] = 0.5 * (ordered[each, (count - 1) // 2] + ordered[each, count // 2])
     return result
 
 
