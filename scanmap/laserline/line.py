@@ -26,7 +26,7 @@ from scanmap.laserline.onward import gaps_in, goes_on
 from scanmap.laserline.params import LaserLineParams
 from scanmap.laserline.path import columns_of_rows
 from scanmap.laserline.peaks import SPECKLE_FROM, fit_gaussian, judged
-from scanmap.laserline.result import LaserLine, Look, Reason, means_along, no_line, without
+from scanmap.laserline.result import LaserLine, Look, Reason, each_picture, means_along, no_line, without
 from scanmap.laserline.rivals import contested
 from scanmap.laserline.rounding import Rounding
 from scanmap.laserline.samples import by_width, samples_of
@@ -166,7 +166,7 @@ def _look(
     windows = np.tile(window, (pictures, 1))
     if params.method == "brightest":
         plane = to_grey(image, params.grey, params.bit_index, max(channel or 0, 0))
-        return [Look(line) for line in _each(_within(brightest(plane, params.min_peak), windows), height)]
+        return [Look(line) for line in each_picture(_within(brightest(plane, params.min_peak), windows), height)]
     if not np.isfinite(window).any():
         return [Look(no_line(height, Reason.WINDOW)) for _ in images]
     # Everything below sees only the columns in question; in fours, which are summed in pairs and those again.
@@ -181,14 +181,7 @@ def _look(
     lines.column_px[:] += left
     places = [own + np.float32(left) for own in course.places]
     means = means_along(lean.reshape(pictures, height))
-    return [Look(*each) for each in zip(_each(lines, height), places, means, strict=True)]
-
-
-def _each(lines: LaserLine, height: int) -> list[LaserLine]:
-    """The lines of pictures of `height` rows one below the other, each by itself."""
-    column, peak, width, sigma, reason = lines
-    own = [slice(k, k + height) for k in range(0, len(reason), height)]
-    return [LaserLine(column[k], peak[k], width[k], sigma[k], reason[k]) for k in own]
+    return [Look(*each) for each in zip(each_picture(lines, height), places, means, strict=True)]
 
 
 def _found(
@@ -216,7 +209,9 @@ def _found(
     line = without(line, runs.frayed(line.column_px, line.width_px, line.peak, line.sigma_px, height), Reason.EDGE)
     free = np.isfinite(window[:, 0]) & (line.reason != Reason.EDGE)
     gaps = gaps_in(line.column_px, free, height)
-    for k, (picture, one) in enumerate(zip(sight.pictures(), _each(line, height), strict=True) if gaps.any() else ()):
+    for k, (picture, one) in enumerate(
+        zip(sight.pictures(), each_picture(line, height), strict=True) if gaps.any() else ()
+    ):
         own = slice(k * height, (k + 1) * height)
         if gaps[k]:
             _go_on(one, doubts.of(own), picture, params, (window[own], free[own]), still)

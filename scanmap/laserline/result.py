@@ -86,6 +86,13 @@ def means_along(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(sums / np.add.reduceat(known, starts, axis=-1, dtype=np.float32), np.float32)
 
 
+def each_picture(lines: LaserLine, height: int) -> list[LaserLine]:
+    """The lines of pictures of `height` rows one below the other, each by itself."""
+    column, peak, width, sigma, reason = lines
+    own = [slice(k, k + height) for k in range(0, len(reason), height)]
+    return [LaserLine(column[k], peak[k], width[k], sigma[k], reason[k]) for k in own]
+
+
 def no_line(height: int, reason: Reason) -> LaserLine:
     """A line of `height` rows that has none."""
     column, peak, width, sigma = (np.full(height, np.nan) for _ in range(4))
