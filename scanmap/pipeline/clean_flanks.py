@@ -1,8 +1,8 @@
 """Lines of which one side is another's are placed by the other side, once the sweep tells how wide a line is.
 
 How wide the line is depends on its range, and so on its column: the laser's sheet spreads, lenses blur. All bearings
-together tell it. Where a stretch of the line is narrower or wider than that its picture is read again, and the flank
-that is still a line's tells where it is (`laserline.by_clean_flanks`).
+together tell it. Where a stretch of the line is narrower or wider than that, and leans, its picture is read again, and
+the flank that is still a line's tells where it is (`laserline.by_clean_flanks`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def by_clean_flanks(
     asked: Mask,
     shots: Callable[[], Iterable[Shot]],
     keys: Sequence[tuple[float, float]],
-) -> int:
-    """Move points in `scan`, in place, whose line has one clean flank, with the doubt in sigma; returns how many.
+) -> None:
+    """Move points in `scan`, in place, whose line has one clean flank, with the doubt in sigma.
 
     Args:
         width_px: (H,) of each bearing: standard deviation of the line's profile.
@@ -52,9 +52,9 @@ def by_clean_flanks(
 
     The thesis's ways to find the line stay as they are.
     """
-    usual = _Usual.of(scan.column_px, width_px, asked) if pipeline.laserline.method == "gauss" else None
+    usual = _Widths.of(scan.column_px, width_px, asked) if pipeline.laserline.method == "gauss" else None
     if usual is None:
-        return 0
+        return
     odd: dict[int, Mask] = {}
     places: dict[tuple[float, float], list[int]] = {}
     for k in usual.doubtful(scan.column_px, width_px, lean):
@@ -73,30 +73,26 @@ def by_clean_flanks(
         column = scan.column_px[k].astype(np.float64)
         return shot, pipeline.by_clean_flanks(shot, column, usual.width(column), odd[k])
 
-    count = 0
-
     def take(told: tuple[Shot, Moved | None]) -> None:
-        nonlocal count
         shot, moved = told
         if moved is None:
             return
         for k in places[shot.time, shot.bearing]:
             rows = np.flatnonzero((moved.by != 0.0) & scan.valid[k])
-            count += len(move(scan, pipeline, k, rows, moved.by[rows], moved.doubt[rows]))
+            move(scan, pipeline, k, rows, moved.by[rows], moved.doubt[rows])
 
     if places:
         run(wanted(), look, [take])
-    return count
 
 
-class _Usual(NamedTuple):
+class _Widths(NamedTuple):
     """How wide lines usually are at a column."""
 
     column: F64  # (G,) rising [px]
     width_px: F64  # (G,)
 
     @classmethod
-    def of(cls, column: F32, width_px: Sequence[F32], asked: Mask) -> _Usual | None:
+    def of(cls, column: F32, width_px: Sequence[F32], asked: Mask) -> _Widths | None:
         """From lines at columns (B, H) and their widths, (H,) each, where `asked` (B, H); None of too few."""
         every = max(1, int(asked.sum()) // _ENOUGH)
         width = np.stack([own[::every] for own in width_px]) if len(width_px) else np.empty((0, 1), np.float32)
