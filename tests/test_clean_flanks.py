@@ -78,6 +78,19 @@ def test_the_clean_flank_says_where_the_line_is(kind: str, side: int) -> None:
     assert np.all(moved.doubt < 0.5 * np.abs(moved.by) + 1e-9)
 
 
+def test_rows_that_are_not_sure_go_with_those_around_them() -> None:
+    """The joint is paler in the middle of the picture, where its line is hardly narrower than usual."""
+    pale, image = np.abs(np.arange(HEIGHT) - HEIGHT // 2) < 15, drawn(light("joint"), COLUMNS)
+    middling = 0.5 * (light("joint") + light("whole"))
+    image[pale] = drawn(middling, COLUMNS)[pale]
+    line = find_laser_line(image, PARAMS).column_px
+    alone = by_clean_flanks(image[pale], PARAMS, line[pale], np.full(pale.sum(), USUAL), ALL[pale])
+    moved = by_clean_flanks(image, PARAMS, line, np.full(HEIGHT, USUAL), ALL)
+    assert not alone.by.any()
+    assert (moved.by[pale] != 0.0).mean() > 0.9
+    assert np.median(np.abs(line + moved.by - COLUMNS)[pale]) < 0.5 * np.median(np.abs(line - COLUMNS)[pale])
+
+
 @pytest.mark.parametrize("kind", ["whole", "narrow", "wide"])
 @pytest.mark.parametrize("quality", [None, 85])
 def test_lines_alike_on_both_sides_stay(kind: str, quality: int | None) -> None:
