@@ -115,7 +115,7 @@ def check_fit(pairs: Pairs, path: Path, width: int, chosen: NDArray[np.intp]) ->
     known = np.isfinite(pairs.column)
     if known.any() and not known.all():
         raise ConfigError(
-            f"{path}: row {int(known.argmin()) + 1} has no column of the image; fill it in, or leave it out"
+            f"{path}: row {int(known.argmin()) + 1} has no column of the image; fill it in, or take the row out"
         )
     if not pairs.has_columns:
         raise ConfigError(
