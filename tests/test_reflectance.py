@@ -34,14 +34,20 @@ def columns(range_m: float) -> F64:
     return np.array([np.interp(range_m, ranges[k, order[k]], column[k, order[k]]) for k in range(HEIGHT)])
 
 
-def swept(seen_at: tuple[int, ...], peak: float, near_m: float = NEAR_M, wall_peak: float = WALL_PEAK) -> Scan:
-    """A sweep of a wall with a mirror after the second look; some bearings see a line of a height near the head."""
+def swept(
+    seen_at: tuple[int, ...], peak: float, near_m: float = NEAR_M, wall_peak: float = WALL_PEAK, others: float = 0.0
+) -> Scan:
+    """A sweep of a wall with a mirror after the second look; some bearings see a line of a height near the head.
+
+    In the mirror's rows the other bearings see a line of the height `others` on the wall.
+    """
     x, far, near, shots = np.arange(WIDTH), columns(WALL_M), columns(near_m), []
     for k, bearing in enumerate(np.radians(np.arange(70.0, 121.0, 5.0))):
         picture = np.random.default_rng(k).normal(20.0, 2.0, (HEIGHT, WIDTH))
         mirror = range(*MIRROR.indices(HEIGHT))
         for row in range(HEIGHT):
-            own, high = (near, peak if k in seen_at else 0.0) if row in mirror else (far, wall_peak)
+            here = (near, peak) if k in seen_at else (far, others)
+            own, high = here if row in mirror else (far, wall_peak)
             picture[row] += high * np.exp(-0.5 * ((x - own[row]) / WIDTH_PX) ** 2)
         image = bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
         shots.append(Shot(k, float(bearing), float(bearing), float(k), image, None))
@@ -80,3 +86,23 @@ def test_black_things_that_are_seen_dimly_stay() -> None:
     # Seen at a grazing angle, or of black gloss: their light is a tenth of the wall's.
     scan = swept((SHOT,), 0.025 * WALL_M**2 * 160.0, near_m=1.0, wall_peak=160.0)
     assert scan.valid[SHOT, MIRROR].mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("seen_at", "near_m", "kept"), [((SHOT,), 0.7, 0), ((SHOT, SHOT + 1), 0.7, 1), ((SHOT,), 1.2, 1)]
+)
+def test_what_polish_shows_of_a_line_is_given_up_among_bearings_that_see_the_wall(
+    seen_at: tuple[int, ...], near_m: float, kept: int
+) -> None:
+    """A tenth of the wall's light, at ranges where that is 0.012 and 0.036 of what the wall reflects."""
+    scan = swept(seen_at, 0.1 * 190.0, near_m, wall_peak=190.0, others=190.0)
+    assert scan.valid[SHOT, MIRROR].mean() == pytest.approx(kept, abs=0.05)
+
+
+@pytest.mark.parametrize(("light", "kept"), [(0.12, 0), (0.5, 1)])
+def test_what_is_blacker_than_any_surface_and_shows_is_given_up_though_two_bearings_agree(
+    light: float, kept: int
+) -> None:
+    scan = swept((SHOT, SHOT + 1), light * 190.0, wall_peak=190.0, others=190.0)
+    assert light / NEARER < 0.004 or kept
+    assert scan.valid[SHOT : SHOT + 2, MIRROR].mean() == pytest.approx(kept, abs=0.05)

@@ -18,7 +18,7 @@ from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.clean_flanks import by_clean_flanks
 from scanmap.pipeline.cut_beams import put_back
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
-from scanmap.pipeline.reflectance import Usual, reflectance
+from scanmap.pipeline.reflectance import Usual, reflectance, shape_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
@@ -79,7 +79,7 @@ class SecondLook:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
         self._keys.append((step.shot.time, step.shot.bearing))
         self._reflectance.append(reflectance(step))
-        self._shape.append(np.array([step.line.peak, step.line.width_px], np.float32))
+        self._shape.append(shape_of(step))
         places = None if step.fault else step.places
         self._places.append(places if step.shot.background is None else None)
         self._listed_in.append(places)
@@ -139,12 +139,13 @@ class SecondLook:
         """The cells (B, H) that show another thing than the line."""
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
-            wrong[k] = known.usual.nothing(self._reflectance[k])
-            hardly = known.usual.hardly(self._reflectance[k])
+            seen = self._reflectance[k], self._shape[k]
+            wrong[k] = known.usual.nothing(*seen)
+            black = known.usual.hardly(self._reflectance[k]) | known.usual.polish(*seen)
             thrown = known.usual.thrown(self._shape[k], scan.range_m[k])
-            if known.neighbours is not None and (hardly.any() or thrown.any()):
+            if known.neighbours is not None and (black | thrown).any():
                 alone, beside_nothing = known.neighbours.alone(k, scan.range_m[k])
-                wrong[k] |= (hardly & alone) | (thrown & beside_nothing)
+                wrong[k] |= (black & alone) | (thrown & beside_nothing)
         for k in views:
             wrong[k] |= self._stands(scan, k, known)
         for k in _beside(scan.bearings, asked, views, [k for k in views if wrong[k].any()]):
@@ -251,7 +252,7 @@ class SecondLook:
                 new = ~scan.valid[k] & (step.profile.reason == Reason.OK)
                 scan.amend(k, new, step.profile)
                 self._reflectance[k][new] = reflectance(step)[new]
-                self._shape[k][:, new] = step.line.peak[new], step.line.width_px[new]
+                self._shape[k][:, new] = shape_of(step)[:, new]
 
         run(wanted(), look, [take])
 
@@ -272,7 +273,7 @@ def _other(step: Step, k: int, known: _Known, ridges: U8 | None) -> Mask:
     other = known.still.line(step.shot.bearing, line.column_px, ridge, share)
     if known.choosing:
         other |= share < SHARE
-    other |= known.usual.nothing(reflectance(step))
+    other |= known.usual.nothing(reflectance(step), shape_of(step))
     return other if ridges is None else other | _hidden(line.column_px, ridge, ridges)
 
 
