@@ -177,3 +177,40 @@ def test_a_line_narrower_than_any_beam_leaves_stays() -> None:
     calibration = head()
     place, weight = cut_beam(1.0, 1.0)
     unmoved(calibration, rows_of(calibration, (0.1 * place, weight), 0.75, 0.9), 0.9)
+
+
+def post_alone(beam: tuple[F64, F64]) -> tuple[F64, F64]:
+    """How far the points of a post that one bearing alone meets are off it [m], and their sigmas, by its beam."""
+    calibration, post_y = head(), 1.6
+    columns = wall_columns(calibration, float(BEARINGS[CUT]), post_y)
+    inside = range(*ROWS.indices(HEIGHT))
+    drawn = [profile(columns[k], beam) if k in inside else np.empty(0) for k in range(HEIGHT)]
+    scan = swept(calibration, {CUT: drawn})
+    found = np.flatnonzero(scan.valid[CUT, ROWS])
+    assert len(found) > 0.9 * len(inside)
+    return scan.points[CUT, ROWS][found, 1].astype(np.float64) - post_y, scan.sigma_m[CUT, ROWS][found].astype(
+        np.float64
+    )
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("share", [0.2, 0.35])
+def test_where_nothing_tells_what_part_of_a_beam_is_left_sigma_says_how_far_it_may_be_off(
+    share: float, side: float
+) -> None:
+    off, sigma = post_alone(cut_beam(share, side))
+    assert abs(np.median(off)) > 0.008
+    assert 0.6 < np.median(np.abs(off) / sigma) < 1.8
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("share", [0.5, 0.65])
+def test_where_enough_of_a_beam_is_left_its_flank_tells(share: float, side: float) -> None:
+    off, sigma = post_alone(cut_beam(share, side))
+    assert np.median(np.abs(off) / sigma) < 1.8
+
+
+def test_a_whole_beam_on_a_post_is_as_sure_as_any() -> None:
+    off, sigma = post_alone(cut_beam(1.0, 1.0))
+    assert np.sqrt(np.mean(np.square(off / sigma))) < 1.5
+    assert np.median(sigma) < 0.004

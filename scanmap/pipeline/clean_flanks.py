@@ -8,7 +8,6 @@ the flank that is still a line's tells where it is (`laserline.by_clean_flanks`)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from scanmap.laserline import BOTH, MEAN_ROWS, ODD, ROWS, UNUSUAL, Moved, means_
 from scanmap.pipeline.moving import move
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline
+from scanmap.pipeline.widths import Widths
 from scanmap.scan import Scan
 from scanmap.shot import Shot
 
@@ -25,8 +25,6 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Of lines by their columns, whose medians tell the usual width; lines of one, at least; lines in all that are enough.
-_GROUPS, _LEAST, _ENOUGH = 16, 400, 40_000
 _AROUND = ROWS // 2  # rows beside a stretch that are read with it
 _SOME = 0.7  # of what counts in ROWS rows, from which on in means of fewer they are asked
 _ODD_OF_LEAN = 0.45  # rms of (z^2 - 1.5) z exp(-z^2 / 2), in which the lean is told, at the places asked
@@ -35,30 +33,28 @@ _ODD_OF_LEAN = 0.45  # rms of (z^2 - 1.5) z exp(-z^2 / 2), in which the lean is 
 def by_clean_flanks(
     scan: Scan,
     pipeline: Pipeline,
+    usual: Widths,
     width_px: Sequence[F32],
     lean: Sequence[F32 | None],
     asked: Mask,
     shots: Callable[[], Iterable[Shot]],
     keys: Sequence[tuple[float, float]],
-) -> None:
-    """Move points in `scan`, in place, whose line has one clean flank, with the doubt in sigma.
+) -> Mask:
+    """Move points in `scan`, in place, whose line has one clean flank, with the doubt in sigma; returns which (B, H).
 
     Args:
+        usual: how wide the scan's lines are.
         width_px: (H,) of each bearing: standard deviation of the line's profile.
         lean: of each bearing, how much the profile leans, as `Look` has it.
         asked: (B, H) cells whose width counts.
         shots: the shots of the scan once more.
         keys: time and bearing of each bearing's shot.
-
-    The thesis's ways to find the line stay as they are.
     """
-    usual = _Widths.of(scan.column_px, width_px, asked) if pipeline.laserline.method == "gauss" else None
-    if usual is None:
-        return
+    put = np.zeros((len(scan), scan.rows), bool)
     odd: dict[int, Mask] = {}
     places: dict[tuple[float, float], list[int]] = {}
-    for k in usual.doubtful(scan.column_px, width_px, lean):
-        rows = usual.odd(scan.column_px[k], np.where(asked[k], width_px[k], np.nan))
+    for k in _doubtful(usual, scan.column_px, width_px, lean):
+        rows = _odd(usual, scan.column_px[k], np.where(asked[k], width_px[k], np.nan))
         if rows.any():
             odd[k] = rows
             places.setdefault(keys[k], []).append(k)
@@ -79,51 +75,30 @@ def by_clean_flanks(
             return
         for k in places[shot.time, shot.bearing]:
             rows = np.flatnonzero((moved.by != 0.0) & scan.valid[k])
-            move(scan, pipeline, k, rows, moved.by[rows], moved.doubt[rows])
+            put[k, move(scan, pipeline, k, rows, moved.by[rows], moved.doubt[rows])] = True
 
     if places:
         run(wanted(), look, [take])
+    return put
 
 
-class _Widths(NamedTuple):
-    """How wide lines usually are at a column."""
+def _doubtful(usual: Widths, column: F32, width_px: Sequence[F32], lean: Sequence[F32 | None]) -> list[int]:
+    """Bearings in which some rows are wider or narrower, and lean, of columns (B, H) and widths, (H,) each."""
+    width = means_along(np.stack(width_px))
+    rows = np.minimum(np.arange(width.shape[1]) * MEAN_ROWS + MEAN_ROWS // 2, column.shape[1] - 1)
+    unknown = np.full(width.shape[1], np.nan, np.float32)
+    with np.errstate(invalid="ignore"):
+        unusual = np.abs(np.log(width / usual.width(column[:, rows])))
+        odd = _ODD_OF_LEAN * np.abs(np.stack([unknown if own is None else own for own in lean]))
+        doubtful = (unusual > _SOME * UNUSUAL) & (odd > _SOME * ODD) & (unusual * odd > _SOME * BOTH)
+    return np.flatnonzero(doubtful.any(axis=1)).tolist()
 
-    column: F64  # (G,) rising [px]
-    width_px: F64  # (G,)
 
-    @classmethod
-    def of(cls, column: F32, width_px: Sequence[F32], asked: Mask) -> _Widths | None:
-        """From lines at columns (B, H) and their widths, (H,) each, where `asked` (B, H); None of too few."""
-        every = max(1, int(asked.sum()) // _ENOUGH)
-        width = np.stack([own[::every] for own in width_px]) if len(width_px) else np.empty((0, 1), np.float32)
-        at = column[:, ::every]
-        known = asked[:, ::every] & np.isfinite(at) & np.isfinite(width)
-        at, width = at[known], width[known]
-        if len(at) < _LEAST:
-            return None
-        groups = np.array_split(np.argsort(at, kind="stable"), min(_GROUPS, len(at) // _LEAST))
-        return cls(*(np.array([np.median(values[some]) for some in groups], np.float64) for values in (at, width)))
-
-    def width(self, column: F32 | F64) -> F64:
-        """Usual widths at columns (...); NaN where there is none."""
-        return np.where(np.isfinite(column), np.interp(column, self.column, self.width_px), np.nan)
-
-    def doubtful(self, column: F32, width_px: Sequence[F32], lean: Sequence[F32 | None]) -> list[int]:
-        """Bearings in which some rows are wider or narrower, and lean, of columns (B, H) and widths, (H,) each."""
-        width = means_along(np.stack(width_px))
-        rows = np.minimum(np.arange(width.shape[1]) * MEAN_ROWS + MEAN_ROWS // 2, column.shape[1] - 1)
-        unknown = np.full(width.shape[1], np.nan, np.float32)
-        with np.errstate(invalid="ignore"):
-            unusual = np.abs(np.log(width / self.width(column[:, rows])))
-            odd = _ODD_OF_LEAN * np.abs(np.stack([unknown if own is None else own for own in lean]))
-            doubtful = (unusual > _SOME * UNUSUAL) & (odd > _SOME * ODD) & (unusual * odd > _SOME * BOTH)
-        return np.flatnonzero(doubtful.any(axis=1)).tolist()
-
-    def odd(self, column: F32, width: F32) -> Mask:
-        """Rows (H,) in and around stretches that are wider or narrower."""
-        with np.errstate(invalid="ignore"):
-            ratio = np.log(width / self.width(column))
-        known = np.isfinite(ratio)
-        mean = cv2.blur(np.where(known, ratio, 0.0)[None], (ROWS, 1), borderType=cv2.BORDER_CONSTANT)
-        odd = (np.abs(mean) > UNUSUAL).astype(np.uint8)
-        return np.asarray(cv2.dilate(odd, np.ones((1, 2 * _AROUND + 1), np.uint8))[0], bool) & known
+def _odd(usual: Widths, column: F32, width: F32) -> Mask:
+    """Rows (H,) in and around stretches that are wider or narrower."""
+    with np.errstate(invalid="ignore"):
+        ratio = np.log(width / usual.width(column))
+    known = np.isfinite(ratio)
+    mean = cv2.blur(np.where(known, ratio, 0.0)[None], (ROWS, 1), borderType=cv2.BORDER_CONSTANT)
+    odd = (np.abs(mean) > UNUSUAL).astype(np.uint8)
+    return np.asarray(cv2.dilate(odd, np.ones((1, 2 * _AROUND + 1), np.uint8))[0], bool) & known

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.clean_flanks import by_clean_flanks
 from scanmap.pipeline.cut_beams import put_back
+from scanmap.pipeline.narrow_lines import doubt_narrow_lines
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.reflectance import Usual, reflectance, shape_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
+from scanmap.pipeline.widths import Widths
 from scanmap.scan import Scan
 from scanmap.scan.second_lines import Pictures
 from scanmap.shot import Shot
@@ -117,10 +119,16 @@ class SecondLook:
             self._choose(scan, views, known._replace(choosing=True), shots)
         widths = [shape[1] for shape in self._shape]
         put = put_back(scan, self._pipeline, self._reflectance, widths, asked)
-        if shots is not None and asked:
-            whole = np.zeros_like(put)
+        whole = np.zeros_like(put)
+        if asked:
             whole[asked] = [np.isfinite(self._reflectance[k]) for k in asked]
-            by_clean_flanks(scan, self._pipeline, widths, self._lean, whole & ~put, shots, self._keys)
+        # The thesis's ways to find the line stay as they are.
+        usual_px = Widths.of(scan.column_px, widths, whole) if self._pipeline.laserline.method == "gauss" else None
+        if usual_px is not None:
+            left = whole & ~put
+            if shots is not None:
+                left &= ~by_clean_flanks(scan, self._pipeline, usual_px, widths, self._lean, left, shots, self._keys)
+            doubt_narrow_lines(scan, self._pipeline, usual_px, widths, left & scan.valid)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
