@@ -184,7 +184,7 @@ def post_alone(beam: tuple[F64, F64]) -> tuple[F64, F64]:
     calibration, post_y = head(), 1.6
     columns = wall_columns(calibration, float(BEARINGS[CUT]), post_y)
     inside = range(*ROWS.indices(HEIGHT))
-    drawn = [profile(columns[k], beam) if k in inside else np.empty(0) for k in range(HEIGHT)]
+    drawn: list[F64 | None] = [profile(columns[k], beam) if k in inside else np.empty(0) for k in range(HEIGHT)]
     scan = swept(calibration, {CUT: drawn})
     found = np.flatnonzero(scan.valid[CUT, ROWS])
     assert len(found) > 0.9 * len(inside)
