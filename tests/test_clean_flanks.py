@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanmap.calibration import Calibration, CalibrationFile, HeadTable, ImageTable
 from scanmap.geometry import transform
-from scanmap.laserline import LaserLineParams, by_clean_flanks, find_laser_line
+from scanmap.laserline import LaserLineParams, Usual, by_clean_flanks, find_laser_line
 from scanmap.pipeline import Pipeline, SecondLook, run
 from scanmap.scan import Scan
 from scanmap.shot import Shot
@@ -26,6 +26,7 @@ USUAL = float(np.hypot(BEAM_PX, BLUR_PX))
 FINE = np.arange(-14.0, 14.0, 0.05)  # [px] from the middle of the beam
 PARAMS = LaserLineParams(grey="luminance_601", pool_rows=9)
 ALL = np.ones(HEIGHT, bool)
+UNSURE, SURE = (Usual(np.full(HEIGHT, USUAL), np.full(HEIGHT, known)) for known in (False, True))
 
 
 def light(kind: str, side: int = 1) -> F64:
@@ -34,6 +35,9 @@ def light(kind: str, side: int = 1) -> F64:
     beam = np.exp(-0.5 * (x / BEAM_PX) ** 2)
     if kind == "joint":  # of tiles, dark, beside the line's middle
         return np.where((x > 0.3) & (x < 3.2), 0.4, 1.0) * beam
+    if kind == "stripe":  # paler, over half of the line, and darker in the room's light, too: it hardly leans
+        stripe = (x > 0.0) & (x < 5.0)
+        return np.where(stripe, 0.64 * beam - 0.36 * LEVEL / PEAK, beam)
     if kind == "edge":  # beyond which there is nothing near
         return np.where(x < 0.7, beam, 0.0)
     if kind == "gloss":  # that shows the line once more
@@ -67,7 +71,7 @@ COLUMNS = 250.3 + 0.11 * np.arange(HEIGHT)
 def test_the_clean_flank_says_where_the_line_is(kind: str, side: int) -> None:
     image = drawn(light(kind, side), COLUMNS)
     line = find_laser_line(image, PARAMS)
-    moved = by_clean_flanks(image, PARAMS, line.column_px, np.full(HEIGHT, USUAL), ALL)
+    moved = by_clean_flanks(image, PARAMS, line.column_px, UNSURE, ALL)
     before, after = line.column_px - COLUMNS, line.column_px + moved.by - COLUMNS
     assert abs(np.median(before)) > 0.4
     assert np.median(np.abs(after)) < 0.4 * np.median(np.abs(before))
@@ -84,23 +88,35 @@ def test_rows_that_are_not_sure_go_with_those_around_them() -> None:
     middling = 0.5 * (light("joint") + light("whole"))
     image[pale] = drawn(middling, COLUMNS)[pale]
     line = find_laser_line(image, PARAMS).column_px
-    alone = by_clean_flanks(image[pale], PARAMS, line[pale], np.full(pale.sum(), USUAL), ALL[pale])
-    moved = by_clean_flanks(image, PARAMS, line, np.full(HEIGHT, USUAL), ALL)
+    alone = by_clean_flanks(image[pale], PARAMS, line[pale], Usual(*(own[pale] for own in UNSURE)), ALL[pale])
+    moved = by_clean_flanks(image, PARAMS, line, UNSURE, ALL)
     assert not alone.by.any()
     assert (moved.by[pale] != 0.0).mean() > 0.9
     assert np.median(np.abs(line + moved.by - COLUMNS)[pale]) < 0.5 * np.median(np.abs(line - COLUMNS)[pale])
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_line_that_hardly_leans_moves_where_its_usual_width_is_sure(side: int) -> None:
+    image = drawn(light("stripe", side), COLUMNS, noise=1.0)
+    line = find_laser_line(image, PARAMS)
+    before = np.median(np.abs(line.column_px - COLUMNS))
+    assert before > 0.3
+    unsure, sure = (by_clean_flanks(image, PARAMS, line.column_px, usual, ALL) for usual in (UNSURE, SURE))
+    assert np.median(np.abs(line.column_px + unsure.by - COLUMNS)) > 0.8 * before
+    assert np.median(np.abs(line.column_px + sure.by - COLUMNS)) < 0.4 * before
+
+
 @pytest.mark.parametrize("kind", ["whole", "narrow", "wide"])
 @pytest.mark.parametrize("quality", [None, 85])
-def test_lines_alike_on_both_sides_stay(kind: str, quality: int | None) -> None:
+@pytest.mark.parametrize("usual", [UNSURE, SURE])
+def test_lines_alike_on_both_sides_stay(kind: str, quality: int | None, usual: Usual) -> None:
     for seed in range(5):
         image = drawn(light(kind), COLUMNS, seed)
         if quality is not None:
             data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
             image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
         line = find_laser_line(image, PARAMS)
-        moved = by_clean_flanks(image, PARAMS, line.column_px, np.full(HEIGHT, USUAL), ALL)
+        moved = by_clean_flanks(image, PARAMS, line.column_px, usual, ALL)
         assert not moved.by.any()
 
 
@@ -108,7 +124,7 @@ def test_noise_that_hides_which_flank_is_clean_moves_nothing() -> None:
     image = drawn(0.35 * light("joint"), COLUMNS, noise=6.0)
     line = find_laser_line(image, PARAMS)
     assert np.isfinite(line.column_px).mean() > 0.5
-    moved = by_clean_flanks(image, PARAMS, line.column_px, np.full(HEIGHT, USUAL), ALL)
+    moved = by_clean_flanks(image, PARAMS, line.column_px, UNSURE, ALL)
     assert (moved.by != 0.0).mean() < 0.1
 
 
@@ -118,7 +134,7 @@ def test_a_laser_off_frame_is_taken_away_first() -> None:
     columns = np.full(HEIGHT, 250.3)
     image = np.clip(drawn(light("joint", -1), columns) + room, 0, 255).astype(np.uint8)
     line = find_laser_line(image, PARAMS, off)
-    moved = by_clean_flanks(image, PARAMS, line.column_px, np.full(HEIGHT, USUAL), ALL, background=off)
+    moved = by_clean_flanks(image, PARAMS, line.column_px, UNSURE, ALL, background=off)
     error = np.abs(line.column_px - columns), np.abs(line.column_px + moved.by - columns)
     assert np.median(error[0]) > 0.4
     assert np.median(error[1]) < 0.4 * np.median(error[0])

@@ -194,13 +194,14 @@ def post_alone(beam: tuple[F64, F64]) -> tuple[F64, F64]:
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("share", [0.2, 0.35])
+@pytest.mark.parametrize(("share", "most"), [(0.2, 2.3), (0.35, 1.8)])
 def test_where_nothing_tells_what_part_of_a_beam_is_left_sigma_says_how_far_it_may_be_off(
-    share: float, side: float
+    share: float, most: float, side: float
 ) -> None:
+    """Of blur, which no edge takes from a line, nothing is known: the less is left of a beam, the less sigma says."""
     off, sigma = post_alone(cut_beam(share, side))
     assert abs(np.median(off)) > 0.008
-    assert 0.6 < np.median(np.abs(off) / sigma) < 1.8
+    assert 0.5 < np.median(np.abs(off) / sigma) < most
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -1,7 +1,7 @@
 """Image (+ background) to `LaserLine`: one sub-pixel column per row."""
 
 from scanmap.laserline.candidates import BLOCK
-from scanmap.laserline.flanks import BOTH, ODD, ROWS, UNUSUAL, Moved, by_clean_flanks
+from scanmap.laserline.flanks import ROWS, Moved, Usual, by_clean_flanks, least_of
 from scanmap.laserline.grey import binary_image, overlay, to_grey
 from scanmap.laserline.line import find_laser_line, laser_of, look, look_at_all
 from scanmap.laserline.params import LaserLineParams, needs_colour
@@ -12,11 +12,8 @@ from scanmap.laserline.sight import Laser
 
 __all__ = [
     "BLOCK",
-    "BOTH",
     "MEAN_ROWS",
-    "ODD",
     "ROWS",
-    "UNUSUAL",
     "Laser",
     "LaserLine",
     "LaserLineParams",
@@ -24,10 +21,12 @@ __all__ = [
     "Moved",
     "Reason",
     "Rounding",
+    "Usual",
     "binary_image",
     "by_clean_flanks",
     "find_laser_line",
     "laser_of",
+    "least_of",
     "look",
     "look_at_all",
     "means_along",

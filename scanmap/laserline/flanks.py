@@ -38,8 +38,12 @@ _MARGIN = 160  # [px] beside the line that are looked at: they tell the noise, a
 _CORE, _REACH, _LEVEL = 0.3, 3.4, 1.2  # [usual widths] where a flank begins and ends, and what it has of the level
 _STEPS = 8
 _LEAST_PX = 1.2  # usual width; a flank of a thinner line has too few samples
-_SHORTEST, _SURE_SHARE = 15, 0.3  # rows of a stretch that are sure, and their share of it
-_STILL, _CLEAN_STILL = 0.04, 0.02  # of the others in it: how unusual they still are, and their clean flank's rest
+# Rows of a stretch that are sure, and their share of it; of a line that is hardly narrower more of them are asked, for
+# print and texture look the same, but do not go on so long.
+_SHORTEST, _LONG, _SURE_SHARE = 15, 75, 0.3
+_SPOILT = 0.012  # rest of its other flank, at least
+# Of the others in it: how unusual they still are, and their clean flank's rest.
+_STILL, _HARDLY_STILL, _CLEAN_STILL = 0.04, 0.01, 0.02
 _JUMP_PX = 2.0  # between rows of different surfaces
 _PLACES = np.linspace(-3.0, 3.0, 13, dtype=np.float32)  # [widths] at which what is left of a line is compared
 _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same of a flank
@@ -48,6 +52,7 @@ _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same o
 # flank, at least where the line is wide, and to settle it where the line is narrow.
 ODD, _ODD_NOISE = 0.02, 0.8
 BOTH = 0.003  # that times UNUSUAL's, at least: what textures and compression do is seldom much of either
+SURE = (0.02, 0.01, 0.0002)  # the three where the line is narrow and the usual width known to a hundredth
 _CLEAN_WIDE, _CLEAN_NARROW, _CLEARLY, _SETTLED = 0.011, 0.009, 2.5, 4.0
 _LOPSIDED = 0.3  # else, of how far both flanks lie from a narrow line, their sum at least
 _FARTHEST_WIDE, _FARTHEST_NARROW, _OTHER = 1.2, 0.65, 1.9  # [usual widths] from the line: the clean flank, the other
@@ -62,6 +67,13 @@ class Moved(NamedTuple):
     doubt: F64  # standard deviation of that
 
 
+class Usual(NamedTuple):
+    """How wide lines are where a picture's are, arrays (H,)."""
+
+    width_px: F64  # standard deviation of the profile; NaN where there is no line
+    sure: Mask  # whether it is known to a hundredth or two
+
+
 class _Lines(NamedTuple):
     """N lines along each other."""
 
@@ -70,6 +82,7 @@ class _Lines(NamedTuple):
     whole: Fit  # Gaussians of the usual kind
     at: F32  # (N,) where they were found, from the middle of the window [px]
     wide: F32  # (N,) how wide they usually are [px]
+    sure: Mask  # (N,) of that
     rest: F32  # (m, N) what the Gaussians leave over at some places, in heights of the line
     noise: F32  # (N,) of a sample, in heights of the line
 
@@ -81,7 +94,8 @@ class _Lines(NamedTuple):
     def of(self, some: Index) -> _Lines:
         """Some of them."""
         y, usable, rest = (values[:, some] for values in (self.y, self.usable, self.rest))
-        return _Lines(y, usable, self.whole.of(some), self.at[some], self.wide[some], rest, self.noise[some])
+        at, wide, noise = (values[some] for values in (self.at, self.wide, self.noise))
+        return _Lines(y, usable, self.whole.of(some), at, wide, self.sure[some], rest, noise)
 
 
 class _Flank(NamedTuple):
@@ -96,7 +110,7 @@ def by_clean_flanks(
     image: U8,
     params: LaserLineParams,
     line: F64,
-    usual: F64,
+    usual: Usual,
     asked: Mask,
     background: U8 | None = None,
     laser: Laser | None = None,
@@ -108,7 +122,7 @@ def by_clean_flanks(
         image: (H, W) grey or (H, W, 3) BGR, laser on.
         params: how the line was found.
         line: (H,) columns that it was found in; NaN without one.
-        usual: (H,) standard deviation of the profile of lines at this range [px].
+        usual: how wide lines are there.
         asked: (H,) rows in question.
         background: the same view with the laser off, or None.
         laser: what another picture of the scan has told of it.
@@ -117,7 +131,7 @@ def by_clean_flanks(
     height = len(line)
     moved = Moved(np.zeros(height), np.zeros(height))
     with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero(asked & np.isfinite(line) & (usual > _LEAST_PX))
+        rows = np.flatnonzero(asked & np.isfinite(line) & (usual.width_px > _LEAST_PX))
     if len(rows) < ROWS:
         return moved
     if background is not None:
@@ -129,16 +143,16 @@ def by_clean_flanks(
     sight = sight_of(image, background, how, height, channel, [rounding], None if laser is None else laser.noise)
     column = np.rint(line[rows]).astype(np.intp)
     y, usable = samples_of(sight, rows, column - first).of(_HALF, slice(None))
-    wide, at = usual[rows].astype(np.float32), (line[rows] - column).astype(np.float32)
+    wide, at = usual.width_px[rows].astype(np.float32), (line[rows] - column).astype(np.float32)
     level = np.minimum(y[:4].mean(axis=0), y[-4:].mean(axis=0))
     rises = np.maximum(y[_HALF - 1 : _HALF + 2].max(axis=0) - level, np.float32(1.0))
     start = Fit(at, wide, rises, level, np.zeros_like(at))
     least, free = np.full_like(at, 3.0), np.full_like(at, np.inf)
     whole = fit_part(y, _X, usable, start, least, free)
     rest = _at(_rest(y, usable, whole), whole.u + _PLACES[:, None] * whole.s)
-    lines = _Lines(y, usable, whole, at, wide, rest, np.float32(sight.noise[0]) / whole.A)
+    lines = _Lines(y, usable, whole, at, wide, usual.sure[rows], rest, np.float32(sight.noise[0]) / whole.A)
     for part in _along(rows, line):
-        worth = np.flatnonzero(_uneven(lines.of(part))) if len(part) >= ROWS else part[:0]
+        worth = np.flatnonzero(np.any(_uneven(lines.of(part)), axis=0)) if len(part) >= ROWS else part[:0]
         if worth.size:
             around = part[max(0, worth[0] - ROWS) : worth[-1] + ROWS + 1]
             by = _told(lines.of(around))
@@ -146,13 +160,24 @@ def by_clean_flanks(
     return moved
 
 
-def _uneven(lines: _Lines) -> Mask:
-    """Which lines (N,) are not as wide as usual, and not alike on both sides, in means along them."""
+def _uneven(lines: _Lines) -> tuple[Mask, Mask]:
+    """Which lines (N,) are not as wide as usual, and not alike on both sides, in means along them; and which hardly."""
     rest = _mean(lines.rest)
     odd = np.sqrt(np.square(0.5 * (rest - rest[::-1])).mean(axis=0))
-    least = np.maximum(np.float32(ODD), np.float32(_ODD_NOISE) * _mean(lines.noise))
-    unusual = np.abs(_mean(lines.ratio))
-    return np.asarray((unusual > UNUSUAL) & (odd > least) & (unusual * odd > BOTH))
+    ratio, loud = _mean(lines.ratio), np.float32(_ODD_NOISE) * _mean(lines.noise)
+
+    def beyond(unusual: float, least: float, both: float) -> Mask:
+        size = np.abs(ratio)
+        return np.asarray((size > unusual) & (odd > np.maximum(np.float32(least), loud)) & (size * odd > both))
+
+    plainly = beyond(UNUSUAL, ODD, BOTH)
+    return plainly, beyond(*SURE) & lines.sure & (ratio < 0) & ~plainly
+
+
+def least_of(sure: Mask) -> tuple[F64, F64, F64]:
+    """UNUSUAL, ODD and BOTH, or SURE where lines are narrow and the usual width is sure."""
+    unusual, odd, both = (np.where(sure, own, usual) for own, usual in zip(SURE, (UNUSUAL, ODD, BOTH), strict=True))
+    return unusual, odd, both
 
 
 def _told(lines: _Lines) -> F32:
@@ -170,25 +195,28 @@ def _told(lines: _Lines) -> F32:
     dimmed &= (np.abs(own) < _FARTHEST_NARROW * wide) & (np.abs(other) < _OTHER * wide)
     added = ~narrow & (left < _CLEAN_WIDE) & (clearer > _CLEARLY) & (np.abs(own) < _FARTHEST_WIDE * wide)
     even = np.abs(level[1] - level[0]) < np.float32(_LEVELS) * _mean(lines.whole.A)
-    sure = _uneven(lines) & even & (dimmed | added)
-    unusual = np.abs(_mean(lines.ratio)) > _STILL
+    plainly, hardly = _uneven(lines)
+    sure, unusual = plainly & even & (dimmed | added), np.abs(_mean(lines.ratio))
+    hardly &= even & dimmed & (rests.max(axis=0) > _SPOILT)
     by: F32 = np.zeros_like(own)
     for side in (0, 1):
         for kind, farthest in ((narrow, _FARTHEST_NARROW), (~narrow, _FARTHEST_WIDE)):
             # Between rows that are sure the same goes on.
-            alike = unusual & kind & even & (rests[side] < rests[1 - side]) & (rests[side] < _CLEAN_STILL)
+            alike = kind & even & (rests[side] < rests[1 - side]) & (rests[side] < _CLEAN_STILL)
             alike &= np.abs(off[side]) < farthest * wide
-            stretch = _around_sure(sure & kind & (clean == side), alike)
+            here = kind & (clean == side)
+            stretch = _around_sure(sure & here, alike & (unusual > _STILL), _SHORTEST)
+            stretch |= _around_sure((sure | hardly) & here, alike & (unusual > _HARDLY_STILL), _LONG)
             by[stretch] = off[side, stretch]
     return by
 
 
-def _around_sure(sure: Mask, alike: Mask) -> Mask:
+def _around_sure(sure: Mask, alike: Mask, shortest: int) -> Mask:
     """Runs (N,) of rows that are sure or alike, of which enough, and a large enough part, are sure."""
     some = sure | alike
     run = np.cumsum(some & ~np.append(False, some[:-1])) * some
     count, whole = np.bincount(run, sure), np.bincount(run)
-    kept = (count >= _SHORTEST) & (count >= _SURE_SHARE * whole)
+    kept = (count >= shortest) & (count >= _SURE_SHARE * whole)
     kept[0] = False
     return np.asarray(kept[run])
 

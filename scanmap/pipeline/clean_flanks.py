@@ -1,8 +1,7 @@
 """Lines of which one side is another's are placed by the other side, once the sweep tells how wide a line is.
 
-How wide the line is depends on its range, and so on its column: the laser's sheet spreads, lenses blur. All bearings
-together tell it. Where a stretch of the line is narrower or wider than that, and leans, its picture is read again, and
-the flank that is still a line's tells where it is (`laserline.by_clean_flanks`).
+Where a stretch of the line is narrower or wider than lines are there (`widths`), and leans, its picture is read again,
+and the flank that is still a line's tells where it is (`laserline.by_clean_flanks`).
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline import BOTH, MEAN_ROWS, ODD, ROWS, UNUSUAL, Moved, means_along
+from scanmap.laserline import ROWS, Moved, Usual, least_of
 from scanmap.pipeline.moving import move
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline
-from scanmap.pipeline.widths import Widths
+from scanmap.pipeline.widths import Seen, Widths
 from scanmap.scan import Scan
 from scanmap.shot import Shot
 
@@ -53,10 +52,12 @@ def by_clean_flanks(
     put = np.zeros((len(scan), scan.rows), bool)
     odd: dict[int, Mask] = {}
     places: dict[tuple[float, float], list[int]] = {}
-    for k in _doubtful(usual, scan.column_px, width_px, lean):
-        rows = _odd(usual, scan.column_px[k], np.where(asked[k], width_px[k], np.nan))
+    seen: dict[int, Seen] = {}  # as they are before anything moves
+    for k in _doubtful(usual, lean):
+        own = usual.of_bearing(k)
+        rows = _odd(np.where(asked[k], width_px[k], np.nan) / own.width_px, own.slant_known)
         if rows.any():
-            odd[k] = rows
+            odd[k], seen[k] = rows, own
             places.setdefault(keys[k], []).append(k)
 
     def wanted() -> Iterator[Shot]:
@@ -66,8 +67,8 @@ def by_clean_flanks(
 
     def look(shot: Shot) -> tuple[Shot, Moved | None]:
         k = places[shot.time, shot.bearing][0]
-        column = scan.column_px[k].astype(np.float64)
-        return shot, pipeline.by_clean_flanks(shot, column, usual.width(column), odd[k])
+        column, own = scan.column_px[k].astype(np.float64), seen[k]
+        return shot, pipeline.by_clean_flanks(shot, column, Usual(own.width_px, own.slant_known), odd[k])
 
     def take(told: tuple[Shot, Moved | None]) -> None:
         shot, moved = told
@@ -82,23 +83,22 @@ def by_clean_flanks(
     return put
 
 
-def _doubtful(usual: Widths, column: F32, width_px: Sequence[F32], lean: Sequence[F32 | None]) -> list[int]:
-    """Bearings in which some rows are wider or narrower, and lean, of columns (B, H) and widths, (H,) each."""
-    width = means_along(np.stack(width_px))
-    rows = np.minimum(np.arange(width.shape[1]) * MEAN_ROWS + MEAN_ROWS // 2, column.shape[1] - 1)
-    unknown = np.full(width.shape[1], np.nan, np.float32)
+def _doubtful(usual: Widths, lean: Sequence[F32 | None]) -> list[int]:
+    """Bearings in which some rows are wider or narrower, and lean."""
+    ratio, slant_known = usual.ratios()
+    unknown = np.full(ratio.shape[1], np.nan, np.float32)
     with np.errstate(invalid="ignore"):
-        unusual = np.abs(np.log(width / usual.width(column[:, rows])))
-        odd = _ODD_OF_LEAN * np.abs(np.stack([unknown if own is None else own for own in lean]))
-        doubtful = (unusual > _SOME * UNUSUAL) & (odd > _SOME * ODD) & (unusual * odd > _SOME * BOTH)
+        unusual, odd = np.abs(ratio), _ODD_OF_LEAN * np.abs(np.stack([unknown if own is None else own for own in lean]))
+        least, least_odd, both = (_SOME * values for values in least_of(slant_known & (ratio < 0)))
+        doubtful = (unusual > least) & (odd > least_odd) & (unusual * odd > both)
     return np.flatnonzero(doubtful.any(axis=1)).tolist()
 
 
-def _odd(usual: Widths, column: F32, width: F32) -> Mask:
-    """Rows (H,) in and around stretches that are wider or narrower."""
+def _odd(ratio: F64, slant_known: Mask) -> Mask:
+    """Rows (H,) in and around stretches that are wider or narrower, of widths over the usual ones."""
     with np.errstate(invalid="ignore"):
-        ratio = np.log(width / usual.width(column))
-    known = np.isfinite(ratio)
-    mean = cv2.blur(np.where(known, ratio, 0.0)[None], (ROWS, 1), borderType=cv2.BORDER_CONSTANT)
-    odd = (np.abs(mean) > UNUSUAL).astype(np.uint8)
-    return np.asarray(cv2.dilate(odd, np.ones((1, 2 * _AROUND + 1), np.uint8))[0], bool) & known
+        off = np.log(ratio)
+    known = np.isfinite(off)
+    mean = cv2.blur(np.where(known, off, 0.0)[None], (ROWS, 1), borderType=cv2.BORDER_CONSTANT)[0]
+    odd = (np.abs(mean) > least_of(slant_known & (mean < 0))[0]).astype(np.uint8)
+    return np.asarray(cv2.dilate(odd[None], np.ones((1, 2 * _AROUND + 1), np.uint8))[0], bool) & known

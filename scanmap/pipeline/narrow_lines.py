@@ -27,6 +27,7 @@ Mask = NDArray[np.bool_]
 # Of the usual width: slanted surfaces and tone curves seldom make a line narrower. In 66 drawn sweeps 1 % of a million
 # rows are; where the middle of the beam meets a surface at all, 0.89 (rms) of what is foretold is how far they are off.
 _NARROW = 0.85
+_SOME = 0.7  # of that, in means of a few rows, before all are asked
 _ROWS, _FEWEST, _MOSTLY = 25, 8, 0.6  # rows along each other that tell, how many must be narrow, and their share
 _T = np.linspace(4.0, -2.0, 200)  # where a beam is cut
 _OFF = np.array([NormalDist().pdf(t) / NormalDist().cdf(t) for t in _T])
@@ -41,8 +42,11 @@ def doubt_narrow_lines(scan: Scan, pipeline: Pipeline, usual: Widths, width_px: 
         width_px: (H,) of each bearing: standard deviation of the line's profile.
         asked: (B, H) cells in question.
     """
-    for k in np.flatnonzero(asked.any(axis=1)).tolist():
-        expected = usual.width(scan.column_px[k])
+    ratios, _ = usual.ratios()
+    with np.errstate(invalid="ignore"):
+        some = (ratios < _SOME * np.log(_NARROW)).any(axis=1) & asked.any(axis=1)
+    for k in np.flatnonzero(some).tolist():
+        expected = usual.of_bearing(k).width_px
         ratio = np.where(asked[k], width_px[k] / expected, np.nan)
         rows = np.flatnonzero(_narrow(ratio))
         if not rows.size:

@@ -123,7 +123,8 @@ class SecondLook:
         if asked:
             whole[asked] = [np.isfinite(self._reflectance[k]) for k in asked]
         # The thesis's ways to find the line stay as they are.
-        usual_px = Widths.of(scan.column_px, widths, whole) if self._pipeline.laserline.method == "gauss" else None
+        gauss = self._pipeline.laserline.method == "gauss"
+        usual_px = Widths.of(scan, self._pipeline.calibration, self._shape, whole) if gauss else None
         if usual_px is not None:
             left = whole & ~put
             if shots is not None:

@@ -19,6 +19,7 @@ from scanmap.laserline import (
     Moved,
     Reason,
     Rounding,
+    Usual,
     by_clean_flanks,
     laser_of,
     look,
@@ -144,7 +145,7 @@ class Pipeline:
             return None
         return ridges(image, self.laserline, self.laser)
 
-    def by_clean_flanks(self, shot: Shot, line: F64, usual: F64, asked: NDArray[np.bool_]) -> Moved | None:
+    def by_clean_flanks(self, shot: Shot, line: F64, usual: Usual, asked: NDArray[np.bool_]) -> Moved | None:
         """What `laserline.by_clean_flanks` says of a shot's line, arrays (H,); None where it cannot be read."""
         try:
             image = self._decode(shot.image, self._grey(shot.image)).image
