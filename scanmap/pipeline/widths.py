@@ -46,7 +46,8 @@ class Seen(NamedTuple):
 class _Model(NamedTuple):
     """What the widths of a sweep's lines have in common."""
 
-    variance: F64  # (3,) the lens's [px^2], the sheet's [m^2 px^2 / m^2], and what that grows by with the range [px^2]
+    # (3,) of the lens [px^2]; of the sheet, and what it grows by with the range, times the focal length's square.
+    variance: F64
     least: float  # of the variance [px^2]
     by_height: float  # logarithm of the width by that of the height
     column: F64  # (G,) rising [px]
@@ -56,11 +57,10 @@ class _Model(NamedTuple):
 class Widths:
     """How wide the lines of a sweep usually are."""
 
-    def __init__(
-        self, scan: Scan, calibration: Calibration, shapes: Sequence[F32], model: _Model | None = None
-    ) -> None:
-        """Of a scan and the heights and widths of its lines, (2, H) for each bearing; `of` fits the model."""
-        self._scan, self._shapes, self._model = scan, shapes, model
+    def __init__(self, scan: Scan, calibration: Calibration, shapes: Sequence[F32]) -> None:
+        """Of a scan and the heights and widths of its lines, (2, H) for each bearing; `of` fits the model to them."""
+        self._scan, self._shapes = scan, shapes
+        self._model = _Model(np.zeros(3), 0.0, 0.0, np.zeros(1), np.zeros(1))
         T = np.stack([scan.mount.T_world_head(float(bearing)) for bearing in scan.bearings])
         T_camera = T @ calibration.T_head_camera
         self._camera, self._forward = T_camera[:, :3, 3], T_camera[:, :3, 2]
@@ -99,7 +99,6 @@ class Widths:
 
     def _seen(self, bearings: Index, rows: Index) -> Seen:
         """Usual widths (N, M) of the lines of some bearings (N,) in some rows (M,)."""
-        assert self._model is not None
         terms, slant_known = self._terms(bearings, rows)
         height = np.stack([self._shapes[k][0, rows] for k in bearings]).astype(np.float64)
         column = self._scan.column_px[np.ix_(bearings, rows)]
