@@ -41,6 +41,7 @@ check: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/laserline.py
+	$(BIN)/python benchmarks/flanks.py
 	$(BIN)/python benchmarks/pipeline.py
 	$(BIN)/python benchmarks/scan.py
 	$(BIN)/python benchmarks/grid.py

@@ -50,7 +50,7 @@ _FLANK = np.arange(0.5, 3.3, 0.5, dtype=np.float32)  # [usual widths] the same o
 # What is left over, rms in heights of the line: of the odd part of a whole line, at least, by itself and in a sample's
 # noise; of a clean flank at most, where the line is wide and where it is narrow; how many times that of the other
 # flank, at least where the line is wide, and to settle it where the line is narrow.
-ODD, _ODD_NOISE = 0.02, 0.8
+ODD, _ODD_NOISE = 0.02, 0.4
 BOTH = 0.003  # that times UNUSUAL's, at least: what textures and compression do is seldom much of either
 SURE = (0.02, 0.01, 0.0002)  # the three where the line is narrow and the usual width known to a hundredth
 _CLEAN_WIDE, _CLEAN_NARROW, _CLEARLY, _SETTLED = 0.011, 0.009, 2.5, 4.0
