@@ -34,6 +34,7 @@ _FARTHEST = 1.0  # [widths] that an edge is believed to move a line by
 _TRUE, _PAINT = 2, 3  # places of the light as it is, and over what was there, among the kinds that `_added` gives
 _SHADOW = 0.1  # by which the former must explain lines better, as the logarithm of what a Gaussian leaves of them
 _CURVE_ROWS, _CURVE_DOUBT_PX = 9, 0.12  # over which a camera's curve does the same, and half of which is believed
+_BESIDE = 0.1  # of a line's height, that the levels on its sides differ by where another line's light lies on one
 _BLUR_PX = 0.8  # of an edge, by optics and pixels
 _RATIO = 4.0  # of the two sides, at most
 _LEAST = 1.0  # [grey levels] of a side
@@ -73,6 +74,17 @@ def sides_of(y: F32, rows: Rows) -> Sides:
             apart.partition(len(apart) // 2)
             scatter[k] = max(scatter[k], apart[len(apart) // 2] / np.float32(0.954))
     return Sides(both[0], both[1], np.abs(both[1] - both[0]) > (np.float32(_SURE) * scatter)[rows.picture])
+
+
+def lean_alone(peaks: Peaks, sides: Sides) -> F32:
+    """How much lines (N,) lean of themselves; NaN where another light beside them, as another line's, makes them lean.
+
+    Args:
+        peaks: of samples from which the room's own light was taken away.
+        sides: of the same.
+    """
+    beside = np.abs(sides.right - sides.left) > np.float32(_BESIDE) * peaks.height
+    return np.where(beside, np.float32(np.nan), peaks.lean)
 
 
 def across_edges(

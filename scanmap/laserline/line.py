@@ -16,7 +16,7 @@ from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import strangers
 from scanmap.laserline.cores import brightest, centre_of_gravity, take_cores
-from scanmap.laserline.edges import across_edges, doubt_of_edges, sides_of
+from scanmap.laserline.edges import across_edges, doubt_of_edges, lean_alone, sides_of
 from scanmap.laserline.error_bars import Doubts, no_doubts, with_error_bars
 from scanmap.laserline.flat import flat_tops
 from scanmap.laserline.grey import to_grey
@@ -275,7 +275,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         line.sigma_px[at_good] = np.maximum(total_sigma[k], _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
         doubts.edges.shift[at_good], doubts.edges.doubt[at_good] = own.shift[k], own.doubt[k]
-        doubts.lean[at_good] = peaks.lean[k]
+        doubts.lean[at_good] = peaks.lean[k] if sight.off is None else lean_alone(peaks, sides)[k]
         doubts.plain[at_good] = (peaks.bias_px[k] == 0.0) & ~peaks.clipped[k]
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanmap.laserline import BLOCK, Reason, ridge_of
 from scanmap.pipeline.clean_flanks import by_clean_flanks
 from scanmap.pipeline.cut_beams import put_back
-from scanmap.pipeline.narrow_lines import doubt_narrow_lines
+from scanmap.pipeline.narrow_lines import place_narrow_lines
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
 from scanmap.pipeline.reflectance import Usual, reflectance, shape_of
 from scanmap.pipeline.running import run
@@ -73,6 +73,7 @@ class SecondLook:
         self._reflectance: list[F32] = []
         self._shape: list[F32] = []  # (2, H) height and width of the lines
         self._lean: list[F32 | None] = []
+        self._has_off: list[bool] = []
         self._places: list[F32 | None] = []  # of pictures without laser-off frames: what does not change is gone there
         self._listed_in: list[F32 | None] = []
         self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
@@ -86,6 +87,7 @@ class SecondLook:
         self._places.append(places if step.shot.background is None else None)
         self._listed_in.append(places)
         self._lean.append(step.lean)
+        self._has_off.append(step.shot.background is not None)
 
     def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
@@ -129,7 +131,8 @@ class SecondLook:
             left = whole & ~put
             if shots is not None:
                 left &= ~by_clean_flanks(scan, self._pipeline, usual_px, widths, self._lean, left, shots, self._keys)
-            doubt_narrow_lines(scan, self._pipeline, usual_px, widths, left & scan.valid)
+            pure = [lean if off else None for lean, off in zip(self._lean, self._has_off, strict=True)]
+            place_narrow_lines(scan, self._pipeline, usual_px, widths, pure, left & scan.valid)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
