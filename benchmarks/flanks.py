@@ -1,10 +1,10 @@
-"""Lines of which one side is another's, and beams cut by a post: how far off before, after, and by what sigma says.
+"""Lines of which one side is another's, on dark joints, of cut beams: how far off before, after, and by sigma.
 
     python benchmarks/flanks.py [--seeds 6]
 
-The pictures are those of tests/test_clean_flanks.py and tests/test_cut_beams.py, 160 rows each; the picture of them
-goes to docs/img/flanks.png: rows from above magnified, what a Gaussian fitted to both halves says in red, the clean
-flank in green, the truth in white.
+The pictures are those of tests/test_clean_flanks.py, tests/test_cut_beams.py and tests/test_joints.py; the picture of
+them goes to docs/img/flanks.png: rows from above magnified, what a Gaussian fitted to both halves says in red, the
+clean flank in green, the truth in white.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from scanmap.laserline import by_clean_flanks, find_laser_line
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import test_clean_flanks as lines
 import test_cut_beams as beams
+import test_joints as joints
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -71,11 +72,28 @@ def magnified(kind: str, image: U8, before: F64, after: F64) -> U8:
 
 def posts() -> None:
     """Print a table of beams of which a post that one bearing meets leaves a share."""
-    print(f"\n{'left of a beam':15s} {'off mm':>7s} {'sigma mm':>9s}")
+    print(f"\n{'left of a beam':15s} {'off mm':>7s} {'sigma mm':>9s}   with laser-off frames")
     for share in (1.0, 0.65, 0.5, 0.35, 0.2):
-        each = [beams.post_alone(beams.cut_beam(share, side)) for side in (-1.0, 1.0)]
-        off, sigma = (np.concatenate(own) for own in zip(*each, strict=True))
-        print(f"{share:15.2f} {1e3 * np.median(np.abs(off)):7.1f} {1e3 * np.median(sigma):9.1f}")
+        row = f"{share:15.2f}"
+        for background in (False, True):
+            each = [beams.post_alone(beams.cut_beam(share, side), background) for side in (-1.0, 1.0)]
+            off, sigma = (np.concatenate(own) for own in zip(*each, strict=True))
+            row += f" {1e3 * np.median(np.abs(off)):7.1f} {1e3 * np.median(sigma):9.1f}  "
+        print(row)
+
+
+def on_joints() -> None:
+    """Print a table of lines on dark joints 1.5 px wide, at six places, seen with laser-off frames; rms over places."""
+    print(f"\n{'lens px':>7s} {'albedo':>7s} {'off px':>7s} {'after':>7s} {'sigma':>7s}   a shadow's after")
+    for lens_px in (0.5, 0.7, 0.9, 1.1, 1.3):
+        for albedo in (0.3, 0.5):
+            each = []
+            for joint_px in (-1.8, -1.0, -0.4, 0.4, 1.0, 1.8):
+                painted, dark = (joints.pair(joint_px, 1.5, albedo, shadow, lens_px) for shadow in (False, True))
+                off, sigma = joints.off_middle(*painted)
+                each.append((joints.plain_fit(*painted[:2]), off, sigma, joints.off_middle(*dark)[0]))
+            before, after, sigma, shadow = np.sqrt(np.mean(np.square(each), axis=0))
+            print(f"{lens_px:7.1f} {albedo:7.1f} {before:7.3f} {after:7.3f} {sigma:7.3f} {shadow:9.3f}")
 
 
 def main() -> None:
@@ -83,6 +101,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6)
     pictures = flanks(parser.parse_args().seeds)
     posts()
+    on_joints()
     folder = Path(__file__).parent.parent / "docs" / "img"
     cv2.imwrite(str(folder / "flanks.png"), np.hstack(pictures))
 

@@ -66,8 +66,15 @@ def profile(column: float, beam: tuple[F64, F64]) -> F64:
     return level
 
 
-def swept(calibration: Calibration, drawn: dict[int, list[F64 | None]]) -> Scan:
-    """A sweep of the wall after the second look; `drawn` replaces rows (H,) of some bearings' pictures."""
+def as_png(picture: F64) -> bytes:
+    return bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
+
+
+def swept(calibration: Calibration, drawn: dict[int, list[F64 | None]], off: bool = False) -> Scan:
+    """A sweep of the wall after the second look; `drawn` replaces rows (H,) of some bearings' pictures.
+
+    With `off` there are laser-off frames.
+    """
     rng = np.random.default_rng(5)
     whole = cut_beam(1.0, 1.0)
     shots = []
@@ -77,8 +84,8 @@ def swept(calibration: Calibration, drawn: dict[int, list[F64 | None]]) -> Scan:
             own = drawn.get(k, [np.empty(0)] * HEIGHT)[row]
             if own is not None and np.isfinite(column):
                 picture[row] += own if own.size else profile(column, whole)
-        image = bytes(cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1])
-        shots.append(Shot(k, bearing, bearing, float(k), image, None))
+        background = as_png(rng.normal(20.0, 2.0, (HEIGHT, WIDTH))) if off else None
+        shots.append(Shot(k, bearing, bearing, float(k), as_png(picture), background))
     pipeline = Pipeline(calibration, LaserLineParams(grey="luminance_601"), TriangulationParams())
     scan, second = Scan(calibration.mount, HEIGHT), SecondLook(pipeline)
     run(shots, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second], workers=1)
@@ -179,13 +186,13 @@ def test_a_line_narrower_than_any_beam_leaves_stays() -> None:
     unmoved(calibration, rows_of(calibration, (0.1 * place, weight), 0.75, 0.9), 0.9)
 
 
-def post_alone(beam: tuple[F64, F64]) -> tuple[F64, F64]:
+def post_alone(beam: tuple[F64, F64], off: bool = False) -> tuple[F64, F64]:
     """How far the points of a post that one bearing alone meets are off it [m], and their sigmas, by its beam."""
     calibration, post_y = head(), 1.6
     columns = wall_columns(calibration, float(BEARINGS[CUT]), post_y)
     inside = range(*ROWS.indices(HEIGHT))
     drawn: list[F64 | None] = [profile(columns[k], beam) if k in inside else np.empty(0) for k in range(HEIGHT)]
-    scan = swept(calibration, {CUT: drawn})
+    scan = swept(calibration, {CUT: drawn}, off)
     found = np.flatnonzero(scan.valid[CUT, ROWS])
     assert len(found) > 0.9 * len(inside)
     return scan.points[CUT, ROWS][found, 1].astype(np.float64) - post_y, scan.sigma_m[CUT, ROWS][found].astype(
@@ -209,6 +216,27 @@ def test_where_nothing_tells_what_part_of_a_beam_is_left_sigma_says_how_far_it_m
 def test_where_enough_of_a_beam_is_left_its_flank_tells(share: float, side: float) -> None:
     off, sigma = post_alone(cut_beam(share, side))
     assert np.median(np.abs(off) / sigma) < 1.8
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("share", [0.35, 0.5, 0.65])
+def test_with_a_laser_off_frame_its_lean_tells_what_part_of_a_beam_is_left(share: float, side: float) -> None:
+    beam = cut_beam(share, side)
+    before = abs(np.median(post_alone(beam)[0])) if share < 0.5 else 0.008
+    off, sigma = post_alone(beam, off=True)
+    assert abs(np.median(off)) < 0.6 * before
+    assert np.sqrt(np.mean(np.square(off / sigma))) < 1.5
+
+
+def test_what_leans_for_another_reason_stays_with_a_laser_off_frame() -> None:
+    """A thin bright line, and the same in a gloss that is brighter on one side."""
+    place, weight = cut_beam(1.0, 1.0)
+    thin = 0.6 * place, weight
+    gloss = 0.3 * np.exp(-0.5 * np.square((place / BEAM_PX - 0.6) / 1.8)) * weight.max()
+    glossy = np.concatenate([0.6 * place, place]), np.concatenate([weight, gloss])
+    for beam in (thin, glossy):
+        without, off = (np.median(post_alone(beam, off)[0]) for off in (False, True))
+        assert abs(off - without) < 0.002
 
 
 def test_a_whole_beam_on_a_post_is_as_sure_as_any() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline.channel import SATURATED
+from scanmap.laserline.joints import Lit, off_joints
 from scanmap.laserline.path import strips
 from scanmap.laserline.peaks import Peaks, fit_gaussian
 from scanmap.laserline.pictures import Rows, not_one
@@ -33,8 +34,10 @@ _REST = 0.15  # of what an edge may do to a line, is left where its explanations
 _FARTHEST = 1.0  # [widths] that an edge is believed to move a line by
 _TRUE, _PAINT = 2, 3  # places of the light as it is, and over what was there, among the kinds that `_added` gives
 _SHADOW = 0.1  # by which the former must explain lines better, as the logarithm of what a Gaussian leaves of them
+_JOINT_DOUBT_PX, _JOINT_REST = 0.05, 0.3  # where a line lies on a dark joint: at least, and of what it is moved by
 _CURVE_ROWS, _CURVE_DOUBT_PX = 9, 0.12  # over which a camera's curve does the same, and half of which is believed
 _BESIDE = 0.1  # of a line's height, that the levels on its sides differ by where another line's light lies on one
+_SKIRT, _GLOSS = (2.5, 3.5), 0.04  # [widths] where, and [heights] how much skirts on both sides are a gloss's
 _BLUR_PX = 0.8  # of an edge, by optics and pixels
 _RATIO = 4.0  # of the two sides, at most
 _LEAST = 1.0  # [grey levels] of a side
@@ -76,15 +79,28 @@ def sides_of(y: F32, rows: Rows) -> Sides:
     return Sides(both[0], both[1], np.abs(both[1] - both[0]) > (np.float32(_SURE) * scatter)[rows.picture])
 
 
-def lean_alone(peaks: Peaks, sides: Sides) -> F32:
-    """How much lines (N,) lean of themselves; NaN where another light beside them, as another line's, makes them lean.
+def lean_alone(y: F32, peaks: Peaks, sides: Sides) -> F32:
+    """How much lines (N,) lean of themselves; zero where other light makes them lean.
+
+    That is another line's beside them, which makes the levels on their two sides differ, or a gloss, which is seen as
+    skirts on both sides: of a line that lacks light, at least one side is steep.
 
     Args:
-        peaks: of samples from which the room's own light was taken away.
-        sides: of the same.
+        y: (n, N) windows from which the room's own light was taken away.
+        peaks: fitted to them.
+        sides: of them.
     """
-    beside = np.abs(sides.right - sides.left) > np.float32(_BESIDE) * peaks.height
-    return np.where(beside, np.float32(np.nan), peaks.lean)
+    x = np.arange(len(y), dtype=np.float32)[:, None] - len(y) // 2
+    z = (x - peaks.offset_px) / peaks.width_px
+    skirts = []
+    for level, there in ((sides.left, -z), (sides.right, z)):
+        skirt = (there > np.float32(_SKIRT[0])) & (there < np.float32(_SKIRT[1]))
+        mean = (y * skirt).sum(axis=0) / np.maximum(skirt.sum(axis=0), 1)
+        rises = np.where(skirt.any(axis=0), mean - level, np.float32(0.0))
+        skirts.append(cv2.blur(rises.astype(np.float32)[None], (_ROWS, 1), borderType=cv2.BORDER_REPLICATE)[0])
+    other = np.minimum(*skirts) > np.float32(_GLOSS) * peaks.height
+    other |= np.abs(sides.right - sides.left) > np.float32(_BESIDE) * peaks.height
+    return np.where(other, np.float32(0.0), peaks.lean)
 
 
 def across_edges(
@@ -140,6 +156,7 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
         return edges
     room = sum(_strips(sight.off, np.clip(rows + k, 0, len(sight.off) - 1), columns, half) for k in (-1, 0, 1))
     smooth = np.array([[1.0], [2.0], [1.0]], np.float32) / np.float32(12.0)
+    seen = np.asarray(room, np.float32) * np.float32(1.0 / 3.0)
     room = np.asarray(cv2.filter2D(np.asarray(room), -1, smooth, borderType=cv2.BORDER_REPLICATE), np.float32)
     low, high = room.min(axis=0), room.max(axis=0)
     contrast = (high - low) / np.maximum(high + low, np.float32(2.0 * _LEAST))
@@ -161,6 +178,12 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
         misfit = (found.noise / np.maximum(found.height, np.float32(1.0))).reshape(u.shape)
         shadow = np.log(misfit[_PAINT] / misfit[_TRUE])
         edges.shift[which] = _by_curve(u[_TRUE], shadow, rows[some], len(sight.off))
+        before = _light(seen.take(some, axis=1))
+        lines = Lit(even[:, _TRUE], before, tells, rows[some], peaks.offset_px[which], peaks.width_px[which])
+        joint, shift = off_joints(lines, len(sight.off), sight.noise, peaks.contrast)
+        at_joint, shift = which[joint], shift[joint]
+        edges.shift[at_joint] = shift
+        edges.doubt[at_joint] = np.hypot(np.float32(_JOINT_DOUBT_PX), np.float32(_JOINT_REST) * shift)
     return edges
 
 

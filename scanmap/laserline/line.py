@@ -275,7 +275,7 @@ def _located(sight: Sight, at: tuple[Index, Index], params: LaserLineParams) -> 
         line.sigma_px[at_good] = np.maximum(total_sigma[k], _SIGMA_LEAST_PX)
         line.reason[at_good] = Reason.OK
         doubts.edges.shift[at_good], doubts.edges.doubt[at_good] = own.shift[k], own.doubt[k]
-        doubts.lean[at_good] = peaks.lean[k] if sight.off is None else lean_alone(peaks, sides)[k]
+        doubts.lean[at_good] = peaks.lean[k] if sight.off is None else lean_alone(y, peaks, sides)[k]
         doubts.plain[at_good] = (peaks.bias_px[k] == 0.0) & ~peaks.clipped[k]
         rest = ~good & (line.reason[r] != Reason.OK)
         line.reason[r[rest]] = reason[rest]

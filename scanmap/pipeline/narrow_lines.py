@@ -35,9 +35,10 @@ _ROWS, _FEWEST, _MOSTLY = 25, 8, 0.6  # rows along each other that tell, how man
 # The lean of a run of such rows, in heights of the line, from which on it is believed, and in its own scatter along
 # the run, of which so many means are asked. In 14 sweeps 2,400 rows are 32 mm off, and 97 % of them lie where it says.
 _LEANS, _SURE, _MEANS = 0.012, 3.0, 3
-_GAP = 60  # rows without a narrow line, inside a run: one edge cuts the beam in all of them
+# Rows of a run that are narrow, as where an edge cuts the beam all are; and rows between runs that one edge may cut.
+_WHOLE, _GAP = 0.8, 60
 _LEAST_PX = 1.2  # usual width: thinner lines lean by where they fall between samples
-_DOUBT = 0.4  # of how far a line is moved: edges are not as sharp as that, and lenses blur what is left
+_DOUBT = 0.5  # of how far a line is moved: edges are not as sharp as that, and lenses blur what is left
 _T = np.linspace(4.0, -2.0, 200)  # where a beam is cut
 _OFF = np.array([NormalDist().pdf(t) / NormalDist().cdf(t) for t in _T])
 _GONE = _OFF * (_T + _OFF)  # rises from 0 to 0.9
@@ -79,7 +80,10 @@ def _side(rows: Index, lean: F32 | None) -> F64:
     side = np.zeros(len(rows))
     if lean is None:
         return side
-    for run in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows) > _GAP) + 1):
+    runs = [run for run in _runs(rows, MEAN_ROWS) if len(run) >= _WHOLE * (rows[run[-1]] - rows[run[0]] + 1)]
+    whole = np.concatenate([np.zeros(0, np.intp), *runs])
+    for part in _runs(rows[whole], _GAP):
+        run = whole[part]
         means = lean[np.unique(rows[run] // MEAN_ROWS)]
         means = means[np.isfinite(means)]
         if len(means) < _MEANS:
@@ -90,11 +94,19 @@ def _side(rows: Index, lean: F32 | None) -> F64:
     return side
 
 
+def _runs(rows: Index, gap: int) -> list[Index]:
+    """Runs of `rows` (N,), by their places among them, with no more than `gap` from one to the next."""
+    return np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows) > gap) + 1)
+
+
 def _narrow(ratio: F64) -> Mask:
     """Rows (H,) that are narrow among others, of widths over what is usual, NaN where there is no line."""
     known, narrow = np.isfinite(ratio), ratio < _NARROW
     some, all_of_them = (_count(values) for values in (narrow, known))
-    return np.asarray(narrow & (some >= _FEWEST) & (some >= _MOSTLY * all_of_them))
+    sure = narrow & (some >= _FEWEST) & (some >= _MOSTLY * all_of_them)
+    # At the ends of a run the rows beyond are counted, too.
+    beside = cv2.dilate(sure.astype(np.uint8)[None], np.ones((1, _ROWS), np.uint8))[0]
+    return np.asarray(narrow & beside.astype(bool))
 
 
 def _means(values: F64, some: Mask) -> F64:
