@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
 from scanmap.laserline import LaserLineParams, find_laser_line, rounding_of
+from scanmap.laserline.offmatch import at_exposure, shift_between
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -36,18 +37,41 @@ def pair(
     away = x - COLUMNS[:, None]
     beam = PEAK * np.exp(-0.5 * np.square(away / BEAM_PX))
     dark = np.where(np.abs(away - joint_px) < 0.5 * wide_px, albedo, 1.0)
-    # Far from the line there is something to see, which tells that the camera has not moved.
-    room = ROOM * np.where(
-        np.abs(away) > 30.0, 1.0 + 0.3 * np.sin(0.2 * x) * np.cos(0.15 * np.arange(HEIGHT))[:, None], 1.0
-    )
     rng, pictures = np.random.default_rng(4), []
-    for light in ((room + beam) * dark if not shadow else room * dark + beam, room * dark):
+    for light in ((ROOM + beam) * dark if not shadow else ROOM * dark + beam, ROOM * dark):
         seen = cv2.GaussianBlur(light, (0, 0), lens_px * FINER, sigmaY=1e-3)
         levels = coded(seen.reshape(HEIGHT, WIDTH, FINER).mean(axis=2)) + rng.normal(0.0, 1.0, (HEIGHT, WIDTH))
         data = cv2.imencode(".jpg", np.clip(np.rint(levels), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 92])
         pictures.append(bytes(data[1]))
     on, off = (np.asarray(cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_GRAYSCALE)) for one in pictures)
     return on, off, pictures[0]
+
+
+def bare_wall() -> tuple[U8, U8]:
+    """A wall without anything on it, seen twice."""
+    _, one, _ = pair(0.0, albedo=1.0)
+    rng = np.random.default_rng(8)
+    noisy = [np.clip(np.rint(one + rng.normal(0.0, 2.0, one.shape)), 0, 255).astype(np.uint8) for _ in range(2)]
+    files = [cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1] for picture in noisy]
+    first, second = (np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE), np.uint8) for file in files)
+    return first, second
+
+
+def test_noise_of_a_bare_wall_is_no_shift() -> None:
+    first, second = bare_wall()
+    first[:, 150:162] = 200  # the laser
+    assert shift_between(first, second) == (0.0, 0.0)
+
+
+def test_what_is_dark_on_a_bare_wall_is_as_dark_in_both_pictures() -> None:
+    """What noise makes dark is brighter in the other picture; a patch that is dark by itself is not."""
+    first, second = bare_wall()
+    for plane in (first, second):
+        plane[40:60, 40:60] -= 15
+    plane, gain = at_exposure(first, second)
+    patch, wall = (slice(42, 58),) * 2, (slice(80, 120), slice(40, 100))
+    for place in (patch, wall):
+        assert abs(gain * plane[place].mean() - second[place].mean()) < 0.4
 
 
 def off_middle(on: U8, off: U8, data: bytes) -> tuple[float, float]:

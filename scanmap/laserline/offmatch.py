@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +11,19 @@ from numpy.typing import NDArray
 from scanmap.laserline.channel import SATURATED
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
 _SHIFT = 3  # [px] looked for at most, down and right
 _SAMPLES, _LEAST_ROWS = 16_000, 10  # that are held against each other
 _MOVED_PX, _SURE = 0.15, 5.0  # a shift that matters: this far, and in its standard deviations
+_SHOWN = 0.3  # share of what pictures change by from pixel to pixel that is no noise, at least, of such as tell a shift
 _BEYOND = 20  # [grey levels] a difference that counts no more for being larger: the line's, a thing that moved
 _MANY = 0.01  # share of such from which on something may have moved
 _BRIGHTEST = 245  # [grey levels] brighter ones may be cut
 _GROUPS, _TELLING = 8, 40  # of samples by brightness, and how many a group must have
 _LARGE = 1_000_000  # samples of a plane from which on fewer of them tell
+_AROUND_PX, _BY_NOISE = 5, 4.0  # [grey levels] that noise makes samples darker or brighter than their group by
 _DARKEST = 8  # [grey levels]
 _DIFFERENT = 0.02  # by how much the factor of a group must differ to be its own
 
@@ -72,6 +77,7 @@ def shift_between(plane: U8, background: U8) -> tuple[float, float]:
     total = np.array([down, right]) + np.clip(step, -1.0, 1.0)
     if not (np.abs(total) > np.maximum(_MOVED_PX, _SURE * sigma)).any():
         return 0.0, 0.0
+    total[sigma > _MOVED_PX] = 0.0  # as along stripes
     return float(total[0]), float(total[1])
 
 
@@ -89,11 +95,14 @@ def _step(on: U8, gain: float, off: list[U8]) -> tuple[NDArray[np.float64], NDAr
     # Moved right by a pixel, a picture changes by as much as it has risen from the pixel on the left.
     slopes = np.stack([0.5 * (down - up)[fits], 0.5 * (right - left)[fits]]).astype(np.float64)
     normal = slopes @ slopes.T + np.eye(2)
-    inverse = np.linalg.inv(normal)
     rest = apart[fits].astype(np.float64)
-    step = inverse @ (slopes @ rest)
+    step = np.linalg.solve(normal, slopes @ rest)
     noise = rest - step @ slopes
-    return step, np.sqrt(np.diag(inverse) * float((noise @ noise) / max(noise.size - 2, 1)))
+    variance = float((noise @ noise) / max(noise.size - 2, 1))
+    # Of the slopes noise makes a part, half of one picture's variance, which tells of no shift: on a bare wall all.
+    shown = 1.0 - 0.25 * noise.size * variance / np.diag(normal)
+    certain = np.where(shown > _SHOWN, shown / np.diag(np.linalg.inv(normal)), 1e-9)
+    return step, np.sqrt(variance / certain)
 
 
 def at_exposure(plane: U8, background: U8) -> tuple[U8, float]:
@@ -103,23 +112,37 @@ def at_exposure(plane: U8, background: U8) -> tuple[U8, float]:
     brightness. Where one's own is surely different, the plane is scaled by them; what it saturates in stays saturated.
     """
     apart = 8 if plane.size < _LARGE else 16
-    on, off = plane[::apart, ::apart].ravel(), background[::apart, ::apart].ravel()
+    around = cv2.blur(background, (_AROUND_PX, _AROUND_PX))
+    on, off, level = (values[::apart, ::apart].ravel() for values in (plane, background, around))
     usable = (off > _DARKEST) & (np.maximum(on, off) < _BRIGHTEST)
-    on, off = on[usable].astype(np.float32), off[usable].astype(np.float32)
+    on, off, level = on[usable].astype(np.float32), off[usable].astype(np.float32), level[usable]
     if len(on) < _TELLING:
         return background, 1.0
-    groups = np.array_split(np.argsort(off, kind="stable"), min(_GROUPS, len(on) // _TELLING))
-    ratio = on / off
-    common = float(np.median(ratio))
-    factor = np.array([np.median(ratio[g]) for g in groups])
-    scatter = np.array([1.48 * np.median(np.abs(ratio[g] - f)) for g, f in zip(groups, factor, strict=True)])
+    common = float(np.median(on / off))
+    middle, factor = _factors(on, off, off, common)
+    if (factor == common).all():
+        return background, common
+    # What noise makes darker than its group seems brighter in the other picture, and it is best to expect just that;
+    # but not of what is darker by itself, as the brightness around it tells, or brighter.
+    true = _factors(on, off, level, common)[1]
+    middle = np.array([middle[0] - _BY_NOISE, *middle, middle[-1] + _BY_NOISE])
+    values = np.arange(256.0)
+    table = np.interp(values, middle, [true[0], *factor, true[-1]])
+    table = np.clip(np.rint(values * table), 0, SATURATED - 1)
+    table[SATURATED:] = 255
+    return np.asarray(cv2.LUT(background, table.astype(np.uint8)), np.uint8), 1.0
+
+
+def _factors(on: F32, off: F32, by: NDArray[Any], common: float) -> tuple[F64, F64]:
+    """Brightness of groups of samples (N,), in the order of `by` (N,), and the factors from `off` to `on`.
+
+    The common factor stands for those that are not surely different.
+    """
+    groups = np.array_split(np.argsort(by, kind="stable"), min(_GROUPS, len(on) // _TELLING))
+    ratios = [on[g] / off[g] for g in groups]
+    factor = np.array([np.median(ratio) for ratio in ratios])
+    scatter = np.array([1.48 * np.median(np.abs(ratio - f)) for ratio, f in zip(ratios, factor, strict=True)])
     # The median's own standard deviation, four times.
     uncertain = 5.0 * scatter / np.sqrt([len(g) for g in groups])
     own = np.abs(factor - common) > np.maximum(uncertain, _DIFFERENT)
-    if not own.any():
-        return background, common
-    values = np.arange(256.0)
-    level = [np.median(off[g]) for g in groups]
-    table = np.clip(np.rint(values * np.interp(values, level, np.where(own, factor, common))), 0, SATURATED - 1)
-    table[SATURATED:] = 255
-    return np.asarray(cv2.LUT(background, table.astype(np.uint8)), np.uint8), 1.0
+    return np.array([np.median(off[g]) for g in groups]), np.where(own, factor, common)
