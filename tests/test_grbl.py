@@ -349,7 +349,7 @@ def test_by_hand_home_is_where_the_head_stands(uno: Uno) -> None:
 def test_small_faults_at_random_moments_are_repaired(uno: Uno, fault: str) -> None:
     board, url = uno
     chance = random.Random(4)
-    stage = open_grbl(StageParams(port=url, timeout_s=0.2))
+    stage = open_grbl(StageParams(port=url, timeout_s=0.5))
     for deg in range(0, 40, 2):
         if fault == "garbage":
             board.faults.garbage = chance.randbytes(20)
