@@ -201,10 +201,10 @@ def _told(lines: _Lines) -> F32:
     by: F32 = np.zeros_like(own)
     for side in (0, 1):
         for kind, farthest in ((narrow, _FARTHEST_NARROW), (~narrow, _FARTHEST_WIDE)):
-            # Between rows that are sure the same goes on.
-            alike = kind & even & (rests[side] < rests[1 - side]) & (rests[side] < _CLEAN_STILL)
-            alike &= np.abs(off[side]) < farthest * wide
             here = kind & (clean == side)
+            # Between rows that are sure the same goes on.
+            alike = even & (here | (kind & (rests[side] < rests[1 - side]))) & (rests[side] < _CLEAN_STILL)
+            alike &= np.abs(off[side]) < farthest * wide
             stretch = _around_sure(sure & here, alike & (unusual > _STILL), _SHORTEST)
             stretch |= _around_sure((sure | hardly) & here, alike & (unusual > _HARDLY_STILL), _LONG)
             by[stretch] = off[side, stretch]
