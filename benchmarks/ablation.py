@@ -81,7 +81,8 @@ RULES: dict[str, tuple[str, str, object]] = {
     "off frame: edges": ("offframe", "line.told_from_edges", lambda found, weak, *_: (found, weak)),
     "off frame: whole runs": ("offframe.borne_out", "offframe.borne_out", no_rows),
     "off frame: moved": ("offmatch.shift_between", "line.in_place", lambda _, background: background),
-    "off frame: exposure": ("offmatch.at_exposure", "sight.at_exposure", lambda _, background: (background, 1.0)),
+    "off frame: exposure": ("offmatch.exposure_between", "difference.exposure_between", lambda *_: (1.0, None)),
+    "off frame: its noise": ("difference._even", "difference._even", lambda own, _: own.astype(np.float32)),
 }
 # fmt: on
 

@@ -1,16 +1,15 @@
-"""Grey conversions against their definitions, the laser-off frame, the thesis's two pictures."""
+"""Grey conversions against their definitions, the thesis's two pictures."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from synthetic_lines import GREEN, RED, LineSpec, clean, sensor
+from synthetic_lines import GREEN, RED, LineSpec, clean
 
 from scanmap.errors import ConfigError
 from scanmap.laserline import LaserLineParams, binary_image, needs_colour, overlay, to_grey
 from scanmap.laserline.channel import laser_channel
-from scanmap.laserline.grey import without_background
 
 pictures = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9).map(lambda shape: (*shape, 3)))
 planes = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12))
@@ -91,47 +90,6 @@ def test_the_lasers_channel_is_measured_even_where_the_core_is_white(colour, cha
     # A window outshines everything in every channel.
     image[40:160, 200:300] = 255
     assert laser_channel(image) == channel
-
-
-@pytest.mark.parametrize("gain", [0.6, 1.0, 1.5])
-def test_the_off_frame_takes_the_room_away_whatever_its_exposure(gain):
-    rng = np.random.default_rng(2)
-    room = np.repeat(rng.uniform(20, 110, (6, 8)), 40, axis=0).repeat(40, axis=1).astype(np.float32)
-    line = np.zeros_like(room)
-    line[:, 100:103] = 80.0
-    lit = without_background(sensor(room + line, 1.0, rng), sensor(room * gain, 1.0, rng)).astype(np.float64)
-    dark = np.ones(room.shape, bool)
-    dark[:, 96:107] = False
-    # Edges of the room differ by the smoothing of the off frame; between them nothing is left but noise.
-    dark[:, ::40] = dark[:, 1::40] = dark[:, 39::40] = dark[:, 38::40] = False
-    dark[::40] = dark[39::40] = dark[1::40] = dark[38::40] = False
-    level = np.median(lit[dark])
-    assert abs(lit[dark].mean() - level) < 0.5
-    assert lit[dark].std() < 2.0
-    assert abs(lit[:, 101].mean() - level - 80.0) < 3.0
-
-
-def test_of_an_even_room_the_off_frame_adds_hardly_any_noise_and_of_its_edges_nothing_stays():
-    """A mean of 25 pixels adds a fiftieth to the noise; of 9, an eighteenth."""
-    rng = np.random.default_rng(4)
-    room = np.full((400, 400), 60.0, np.float32)
-    room[:, 200:] = 110.0
-    on, off = sensor(room, 3.0, rng), sensor(room, 3.0, rng)
-    lit = without_background(on, off).astype(np.float64)
-    assert lit[:, :190].std() / on[:, :190].std() < 1.04
-    assert abs(lit[:, 195:205].mean(axis=0) - np.median(lit)).max() < 1.0
-
-
-def test_the_off_threshold_takes_small_differences_for_none():
-    rng = np.random.default_rng(3)
-    room = np.full((80, 80), 60.0, np.float32)
-    line = np.zeros_like(room)
-    line[:, 40] = 50.0
-    on, off = sensor(room + line, 2.0, rng), sensor(room, 2.0, rng)
-    lit = without_background(on, off, threshold=15.0)
-    level = np.median(lit)
-    assert (np.delete(lit, [39, 40, 41], axis=1) == level).all()
-    assert (lit[:, 40] > level + 15).all()
 
 
 @given(planes)

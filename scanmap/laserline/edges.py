@@ -36,6 +36,7 @@ _TRUE, _PAINT = 2, 3  # places of the light as it is, and over what was there, a
 _SHADOW = 0.1  # by which the former must explain lines better, as the logarithm of what a Gaussian leaves of them
 _JOINT_DOUBT_PX, _JOINT_REST = 0.05, 0.3  # where a line lies on a dark joint: at least, and of what it is moved by
 _CURVE_ROWS, _CURVE_DOUBT_PX = 9, 0.12  # over which a camera's curve does the same, and half of which is believed
+_CLEAR = 0.7  # like _SHADOW, from which on the half of less is believed
 _BESIDE = 0.1  # of a line's height, that the levels on its sides differ by where another line's light lies on one
 _SKIRT, _GLOSS = (2.5, 3.5), 0.04  # [widths] where, and [heights] how much skirts on both sides are a gloss's
 _BLUR_PX = 0.8  # of an edge, by optics and pixels
@@ -149,15 +150,12 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     the line is moved to where its light is.
     """
     edges = no_edges(len(good))
-    assert sight.off is not None
+    assert sight.off is not None and sight.even is not None
     half = len(usable) // 2
     rows, columns = (values[good] for values in at)
     if not rows.size:
         return edges
-    room = sum(_strips(sight.off, np.clip(rows + k, 0, len(sight.off) - 1), columns, half) for k in (-1, 0, 1))
-    smooth = np.array([[1.0], [2.0], [1.0]], np.float32) / np.float32(12.0)
-    seen = np.asarray(room, np.float32) * np.float32(1.0 / 3.0)
-    room = np.asarray(cv2.filter2D(np.asarray(room), -1, smooth, borderType=cv2.BORDER_REPLICATE), np.float32)
+    room = _strips(sight.even, rows, columns, half)
     low, high = room.min(axis=0), room.max(axis=0)
     contrast = (high - low) / np.maximum(high + low, np.float32(2.0 * _LEAST))
     uneven = high - low > np.float32(_UNEVEN * sight.noise[0])
@@ -177,10 +175,12 @@ def doubt_of_edges(peaks: Peaks, good: NDArray[np.bool_], sight: Sight, at: tupl
     if is_compressed(sight.roundings[0]):
         misfit = (found.noise / np.maximum(found.height, np.float32(1.0))).reshape(u.shape)
         shadow = np.log(misfit[_PAINT] / misfit[_TRUE])
-        edges.shift[which] = _by_curve(u[_TRUE], shadow, rows[some], len(sight.off))
-        before = _light(seen.take(some, axis=1))
+        edges.shift[which] = _by_curve(u[_TRUE], shadow, rows[some], len(sight.even))
+        above, below = (np.clip(rows[some] + k, 0, len(sight.off) - 1) for k in (-1, 1))
+        seen = sum(_strips(sight.off, row, columns[some], half) for row in (above, rows[some], below))
+        before = _light(np.asarray(seen, np.float32) * np.float32(sight.gain / 3.0))
         lines = Lit(even[:, _TRUE], before, tells, rows[some], peaks.offset_px[which], peaks.width_px[which])
-        joint, shift = off_joints(lines, len(sight.off), sight.noise, peaks.contrast)
+        joint, shift = off_joints(lines, len(sight.even), sight.noise, peaks.contrast)
         at_joint, shift = which[joint], shift[joint]
         edges.shift[at_joint] = shift
         edges.doubt[at_joint] = np.hypot(np.float32(_JOINT_DOUBT_PX), np.float32(_JOINT_REST) * shift)
@@ -191,8 +191,8 @@ def _by_curve(moved: F32, shadow: F32, row: Index, height: int) -> F32:
     """What is to be believed of how far lines in `row` (M,) are `moved` (M,) [px] to where their light is.
 
     Cameras that compress code light by a curve. One row's noise is as large as what that does to most lines; what all
-    rows around have in common is not, and counts the more the larger it is. Where they are paint's as well as a
-    `shadow`'s (M,) nothing is moved.
+    rows around have in common is not, and counts the more the larger it is, and the clearer it is that the edges are a
+    `shadow`'s (M,). Where they are paint's as well nothing is moved.
     """
     total, count, kind = np.zeros((3, height), np.float32)
     total[row], count[row], kind[row] = np.minimum(np.maximum(moved, -_FARTHEST), _FARTHEST), 1.0, shadow
@@ -200,8 +200,10 @@ def _by_curve(moved: F32, shadow: F32, row: Index, height: int) -> F32:
         np.asarray(cv2.blur(v[None], (_CURVE_ROWS, 1), borderType=cv2.BORDER_CONSTANT)[0], np.float32)[row]
         for v in (total, count, kind)
     )
-    common = sums / rows * (kinds > np.float32(_SHADOW) * rows)
-    believed: F32 = common * (np.square(common) / (np.square(common) + np.float32(_CURVE_DOUBT_PX**2)))
+    kinds /= rows
+    common = sums / rows * (kinds > np.float32(_SHADOW))
+    doubt = np.float32(_CURVE_DOUBT_PX * _CLEAR) / np.maximum(kinds, np.float32(_CLEAR))
+    believed: F32 = common * (np.square(common) / (np.square(common) + np.square(doubt)))
     return believed
 
 

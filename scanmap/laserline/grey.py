@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.errors import ConfigError
-from scanmap.laserline.channel import SATURATED, exposure_gain, laser_channel
+from scanmap.laserline.channel import laser_channel
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -70,55 +70,6 @@ def to_grey(image: U8, grey: Grey, bit_index: int = 16, channel: int | None = No
         red, total = image[..., 2].astype(np.float32), image.sum(axis=2, dtype=np.float32)
         return np.asarray(np.clip(red * red * 3.0 / np.maximum(total, 1.0), 0, 255), np.uint8)
     raise ConfigError(f"grey conversion {grey!r}; valid: auto, bit_index, red, green, blue, mean, ...")
-
-
-# What a difference image is lifted by, so that noise around zero stays whole: cut at zero it is not Gaussian.
-PEDESTAL = 16
-_ROWS_AT_ONCE = 120
-_ROUGH = 16  # [grey levels] what noise makes neighbours of an even surface differ by at most
-_EVEN_PX, _EVEN = 5, 8  # columns and rows over which means of 3 x 3 neighbours differ by no more [grey levels]
-
-
-def without_background(plane: U8, background: U8, threshold: float = 0.0, gain: float | None = None) -> U8:
-    """What the laser added (H, W): laser on minus laser off, lifted by `PEDESTAL`.
-
-    The exposure may have changed between the two: the off-plane is first brought to the on-plane's level by
-    the gain that matches them where neither saturates, measured on a coarse grid. It is smoothed over 5x5 or 3x3
-    pixels where it is even, which takes most of its noise; where it has edges they must stay what they are.
-    What the off-plane saturates in tells nothing and counts as no light.
-
-    Args:
-        threshold: differences below it count as none [grey levels].
-        gain: what `exposure_gain` gives, where it is known.
-    """
-    gain = exposure_gain(plane[::8, ::8], background[::8, ::8]) if gain is None else gain
-    lit = np.empty(plane.shape, np.uint8)
-    # Some rows at a time, which stay in the processor's cache from step to step; smoothing needs more on each side.
-    for top in range(0, len(plane), _ROWS_AT_ONCE):
-        first, end = max(top - _EVEN_PX, 0), top + _ROWS_AT_ONCE
-        part = _less(plane[first : end + _EVEN_PX], background[first : end + _EVEN_PX], threshold, gain)
-        lit[top:end] = part[top - first : end - first]
-    return lit
-
-
-def _less(plane: U8, background: U8, threshold: float, gain: float) -> U8:
-    # Over few pixels where they are alike, and over more where these means are.
-    few = np.asarray(cv2.copyTo(background, _rough(background, 3, _ROUGH), cv2.blur(background, (3, 3))), np.uint8)
-    even = cv2.copyTo(few, _rough(few, _EVEN_PX, _EVEN), cv2.blur(background, (_EVEN_PX, _EVEN_PX)))
-    lit = cv2.addWeighted(plane, 1.0, even, -gain, float(PEDESTAL))
-    _, blind = cv2.threshold(background, SATURATED - 1, 255, cv2.THRESH_BINARY)
-    if cv2.countNonZero(blind):
-        lit[blind > 0] = PEDESTAL
-    if threshold > 0:
-        lit[lit < PEDESTAL + threshold] = PEDESTAL
-    return np.asarray(lit, np.uint8)
-
-
-def _rough(plane: U8, size: int, most: int) -> U8:
-    """255 where pixels of a plane differ by more than that from one another within so many columns and rows."""
-    around = np.ones((size, size), np.uint8)
-    differ = cv2.subtract(cv2.dilate(plane, around), cv2.erode(plane, around))
-    return np.asarray(cv2.threshold(differ, most, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
 def binary_image(plane: U8) -> U8:

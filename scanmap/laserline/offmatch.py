@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from scanmap.laserline.channel import SATURATED
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -16,15 +12,16 @@ U8 = NDArray[np.uint8]
 
 _SHIFT = 3  # [px] looked for at most, down and right
 _SAMPLES, _LEAST_ROWS = 16_000, 10  # that are held against each other
-_MOVED_PX, _SURE = 0.15, 5.0  # a shift that matters: this far, and in its standard deviations
+_MOVED_PX = 0.15  # that a shift matters
+_SURE = 5.0  # standard deviations, from which on a shift, or a factor, is there
 _SHOWN = 0.3  # share of what pictures change by from pixel to pixel that is no noise, at least, of such as tell a shift
 _BEYOND = 20  # [grey levels] a difference that counts no more for being larger: the line's, a thing that moved
 _MANY = 0.01  # share of such from which on something may have moved
 _BRIGHTEST = 245  # [grey levels] brighter ones may be cut
 _GROUPS, _TELLING = 8, 40  # of samples by brightness, and how many a group must have
 _LARGE = 1_000_000  # samples of a plane from which on fewer of them tell
-_AROUND_PX, _BY_NOISE = 5, 4.0  # [grey levels] that noise makes samples darker or brighter than their group by
 _DARKEST = 8  # [grey levels]
+_OUTLYING = 3.0  # [scatter] from where on samples may be the line's
 _DIFFERENT = 0.02  # by how much the factor of a group must differ to be its own
 
 
@@ -105,44 +102,40 @@ def _step(on: U8, gain: float, off: list[U8]) -> tuple[NDArray[np.float64], NDAr
     return step, np.sqrt(variance / certain)
 
 
-def at_exposure(plane: U8, background: U8) -> tuple[U8, float]:
-    """The laser-off plane (H, W), and what it must be multiplied by to have the laser-on one's exposure.
+def exposure_between(plane: U8, background: U8, level: U8) -> tuple[float, F32 | None]:
+    """What the laser-off plane (H, W) must be multiplied by to have the laser-on one's exposure.
 
-    A camera that exposes by itself need not scale dark and bright alike: the factor is measured for some groups of
-    brightness. Where one's own is surely different, the plane is scaled by them; what it saturates in stays saturated.
+    Args:
+        level: (H, W) the laser-off plane without its noise: what noise makes darker in one picture is brighter in the
+            other.
+
+    Returns:
+        The factor of most of the picture; and, as a camera that exposes by itself need not scale dark and bright alike,
+        those of every level (256,), where some are surely different.
     """
-    apart = 8 if plane.size < _LARGE else 16
-    around = cv2.blur(background, (_AROUND_PX, _AROUND_PX))
-    on, off, level = (values[::apart, ::apart].ravel() for values in (plane, background, around))
-    usable = (off > _DARKEST) & (np.maximum(on, off) < _BRIGHTEST)
-    on, off, level = on[usable].astype(np.float32), off[usable].astype(np.float32), level[usable]
+    every = 8 if plane.size < _LARGE else 16
+    on, off, by = (values[::every, ::every].ravel() for values in (plane, background, level))
+    usable = (by > _DARKEST) & (np.maximum(on, off) < _BRIGHTEST)
+    on, off, by = on[usable], off[usable], by[usable]
     if len(on) < _TELLING:
-        return background, 1.0
-    common = float(np.median(on / off))
-    middle, factor = _factors(on, off, off, common)
-    if (factor == common).all():
-        return background, common
-    # What noise makes darker than its group seems brighter in the other picture, and it is best to expect just that;
-    # but not of what is darker by itself, as the brightness around it tells, or brighter.
-    true = _factors(on, off, level, common)[1]
-    middle = np.array([middle[0] - _BY_NOISE, *middle, middle[-1] + _BY_NOISE])
-    values = np.arange(256.0)
-    table = np.interp(values, middle, [true[0], *factor, true[-1]])
-    table = np.clip(np.rint(values * table), 0, SATURATED - 1)
-    table[SATURATED:] = 255
-    return np.asarray(cv2.LUT(background, table.astype(np.uint8)), np.uint8), 1.0
-
-
-def _factors(on: F32, off: F32, by: NDArray[Any], common: float) -> tuple[F64, F64]:
-    """Brightness of groups of samples (N,), in the order of `by` (N,), and the factors from `off` to `on`.
-
-    The common factor stands for those that are not surely different.
-    """
+        return 1.0, None
+    common, _ = _factor(on, off)
     groups = np.array_split(np.argsort(by, kind="stable"), min(_GROUPS, len(on) // _TELLING))
-    ratios = [on[g] / off[g] for g in groups]
-    factor = np.array([np.median(ratio) for ratio in ratios])
-    scatter = np.array([1.48 * np.median(np.abs(ratio - f)) for ratio, f in zip(ratios, factor, strict=True)])
-    # The median's own standard deviation, four times.
-    uncertain = 5.0 * scatter / np.sqrt([len(g) for g in groups])
-    own = np.abs(factor - common) > np.maximum(uncertain, _DIFFERENT)
-    return np.array([np.median(off[g]) for g in groups]), np.where(own, factor, common)
+    factors = np.array([_factor(on[group], off[group]) for group in groups])
+    apart, sigma = factors[:, 0] - common, factors[:, 1]
+    if not (np.abs(apart) > np.maximum(_SURE * sigma, _DIFFERENT)).any():
+        return common, None
+    believed = common + apart * np.square(apart) / (np.square(apart) + np.square(sigma) + 1e-12)
+    table = np.interp(np.arange(256.0), [float(np.median(by[group])) for group in groups], believed)
+    return common, table.astype(np.float32)
+
+
+def _factor(on: U8, off: U8) -> tuple[float, float]:
+    """What samples `off` (N,) are multiplied by to be those `on`, and its standard deviation; without the line's."""
+    ratio = on / np.maximum(off, np.float32(1.0))
+    middle = np.median(ratio)
+    scatter = 1.48 * np.median(np.abs(ratio - middle))
+    # Medians of what small whole numbers are over each other take steps.
+    fits = np.abs(ratio - middle) <= _OUTLYING * scatter
+    total = [int(values[fits].sum()) for values in (on, off)]
+    return total[0] / max(total[1], 1), float(1.25 * scatter / np.sqrt(len(on)))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scanmap.laserline.candidates import BLOCK, is_large, noises_of
 from scanmap.laserline.channel import judged_channel
 from scanmap.laserline.colour import without_colour
-from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey, without_background
-from scanmap.laserline.offmatch import at_exposure
+from scanmap.laserline.difference import without_background
+from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey
 from scanmap.laserline.pictures import check_width
 from scanmap.laserline.rounding import Mixture, Rounding, best_mixture
 
@@ -57,6 +57,7 @@ class Sight(NamedTuple):
     height: int  # H, rows of a picture
     on: U8  # (P H, W) the pictures' plane; a view where one of their channels will do
     off: U8 | None  # (H, W) the laser-off frame's, of a single picture
+    even: U8 | None  # (H, W) that without its noise, at the laser-on one's exposure
     plane: U8  # (P H, W) the brighter of both
     lit: U8  # (P H, W) what the laser added, lifted by PEDESTAL, with a laser-off frame; else the plane
     rows: U8  # (P ceil(B / 2), W) of lit: one row of every other block, contiguous
@@ -130,12 +131,13 @@ def sight_of(
         noise = _noises(plane, rows, height)
         each = zip(range(0, len(image), height), noise, roundings, strict=True)
         mixtures = [_mixture(image[k : k + height], channel, own, rounding, noises) for k, own, rounding in each]
-        return Sight(height, plane, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
+        return Sight(height, plane, None, None, plane, plane, rows, image, seen, channel, noise, mixtures, roundings)
     on = plane = lit = to_grey(image, how.grey, how.bit_index, channel)
-    off, beside, on_beside, gain = None, None, None, 1.0
+    off, even, beside, on_beside, gain = None, None, None, None, 1.0
     if background is not None:
-        off, gain = at_exposure(on, to_grey(background, how.grey, how.bit_index, channel))
-        lit, plane = without_background(on, off, how.off_threshold, gain), np.asarray(cv2.max(on, off), np.uint8)
+        dark = to_grey(background, how.grey, how.bit_index, channel)
+        lit, off, even, gain = without_background(on, dark, how.off_threshold)
+        plane = np.asarray(cv2.max(on, off), np.uint8)
     rows = np.ascontiguousarray(quick_rows(lit, height))
     noise = _noises(lit, rows, height)
     mixtures = [Mixture(-1 if channel is None else channel)] * len(noise)
@@ -143,9 +145,9 @@ def sight_of(
         mixture = _mixture(image, channel, float(noise[0]), roundings[0], noises)
         if mixture.channel >= 0:
             on_beside, off_beside = (extract(picture, NEIGHBOUR[channel]) for picture in (image, background))
-            off_beside, gain_beside = at_exposure(on_beside, off_beside)
-            beside, mixtures = without_background(on_beside, off_beside, gain=gain_beside), [mixture]
-    return Sight(height, on, off, plane, lit, rows, None, None, -1, noise, mixtures, roundings, gain, beside, on_beside)
+            beside, mixtures = without_background(on_beside, off_beside).lit, [mixture]
+    told = noise, mixtures, roundings, gain, beside, on_beside
+    return Sight(height, on, off, even, plane, lit, rows, None, None, -1, *told)
 
 
 def channel_of(image: U8, background: U8 | None, grey: Grey) -> int | None:
