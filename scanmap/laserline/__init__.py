@@ -4,6 +4,7 @@ from scanmap.laserline.candidates import BLOCK
 from scanmap.laserline.flanks import ROWS, Moved, Usual, by_clean_flanks, least_of
 from scanmap.laserline.grey import binary_image, overlay, to_grey
 from scanmap.laserline.line import find_laser_line, laser_of, look, look_at_all
+from scanmap.laserline.offmatch import slide_between
 from scanmap.laserline.params import LaserLineParams, needs_colour
 from scanmap.laserline.result import MEAN_ROWS, LaserLine, Look, Reason, means_along
 from scanmap.laserline.ridges import ridge_of, ridges
@@ -35,5 +36,6 @@ __all__ = [
     "ridge_of",
     "ridges",
     "rounding_of",
+    "slide_between",
     "to_grey",
 ]

@@ -51,8 +51,17 @@ def noises_of(planes: U8) -> F64:
     noises, median = np.empty(pictures), 3.0
     for k, own in enumerate(step):
         median = _median_of(own, int(median + 0.5))
-        noises[k] = min(max(median / 0.954, 0.3), 60.0)  # half of all differences of Gaussian noise lie below that
+        noises[k] = _noise_by(median)
     return noises
+
+
+def noise_of(steps: U8) -> float:
+    """The same, from differences (N,) of neighbours."""
+    return _noise_by(_median_of(steps, 3))
+
+
+def _noise_by(median: float) -> float:
+    return min(max(median / 0.954, 0.3), 60.0)  # half of all differences of Gaussian noise lie below that
 
 
 def _median_of(step: NDArray[Any], near: int) -> float:

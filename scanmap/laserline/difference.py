@@ -44,7 +44,7 @@ class Difference(NamedTuple):
     gain: float
 
 
-def without_background(plane: U8, background: U8, threshold: float = 0.0) -> Difference:
+def without_background(plane: U8, background: U8, threshold: float = 0.0, matched: bool = False) -> Difference:
     """What the laser added to a plane (H, W), of which `background` is the laser-off frame.
 
     The noise of the laser-off frame is taken out where the room is even along the line, or all around; what stands out
@@ -55,15 +55,16 @@ def without_background(plane: U8, background: U8, threshold: float = 0.0) -> Dif
 
     Args:
         threshold: differences below it count as none [grey levels].
+        matched: whether both have the same exposure.
     """
-    noise = _noise_of(plane, background, exposure_gain(plane[::8, ::8], background[::8, ::8]))
+    noise = _noise_of(plane, background, 1.0 if matched else exposure_gain(plane[::8, ::8], background[::8, ::8]))
     even = np.empty(plane.shape, np.float32)
     # Some rows at a time, which stay in the processor's cache from step to step; filters see more on each side.
     for top in range(0, len(plane), _ROWS_AT_ONCE):
         first, end = max(top - _REACH, 0), min(top + _ROWS_AT_ONCE, len(plane))
         even[top:end] = _even(background[first : end + _REACH], noise)[top - first : end - first]
     level = np.asarray(cv2.convertScaleAbs(even), np.uint8)
-    gain, by_level = exposure_between(plane, background, level)
+    gain, by_level = (1.0, None) if matched else exposure_between(plane, background, level)
     blind, off = background >= SATURATED, background
     if by_level is not None:
         gain, factor = 1.0, cv2.LUT(level, by_level)

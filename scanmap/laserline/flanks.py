@@ -115,6 +115,7 @@ def by_clean_flanks(
     background: U8 | None = None,
     laser: Laser | None = None,
     rounding: Rounding | None = None,
+    matched: bool = False,
 ) -> Moved:
     """Where a picture's line is by the clean one of its flanks, in rows where the other is not.
 
@@ -127,6 +128,7 @@ def by_clean_flanks(
         background: the same view with the laser off, or None.
         laser: what another picture of the scan has told of it.
         rounding: of the file that the picture was.
+        matched: whether `background` lies on the picture as it is, at its exposure.
     """
     height = len(line)
     moved = Moved(np.zeros(height), np.zeros(height))
@@ -134,13 +136,15 @@ def by_clean_flanks(
         rows = np.flatnonzero(asked & np.isfinite(line) & (usual.width_px > _LEAST_PX))
     if len(rows) < ROWS:
         return moved
-    if background is not None:
+    if background is not None and not matched:
         background = in_place(image, background)
     channel = channel_of(image, background, params.grey) if laser is None or image.ndim == 2 else laser.channel
     first, last = max(0, int(line[rows].min()) - _MARGIN) // 4 * 4, int(line[rows].max()) + _MARGIN
     image, background = image[:, first:last], None if background is None else background[:, first:last]
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
-    sight = sight_of(image, background, how, height, channel, [rounding], None if laser is None else laser.noise)
+    sight = sight_of(
+        image, background, how, height, channel, [rounding], None if laser is None else laser.noise, matched
+    )
     column = np.rint(line[rows]).astype(np.intp)
     y, usable = samples_of(sight, rows, column - first).of(_HALF, slice(None))
     wide, at = usual.width_px[rows].astype(np.float32), (line[rows] - column).astype(np.float32)

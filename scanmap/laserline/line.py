@@ -41,12 +41,10 @@ Mask = NDArray[np.bool_]
 
 # [px] what the search needs to see beside the window at quarter resolution.
 _MARGIN = 64
-# No sample is known well enough for less.
-_SIGMA_LEAST_PX = 0.003
+_SIGMA_LEAST_PX = 0.003  # no sample is known well enough for less
 # A saturated line this wide, fitted this many times worse than noise explains, is a core in a halo.
 _HALO_WIDTH_PX, _HALO_MISFIT = 2.5, 2.5
-# Short runs of rows known no better than this are given up.
-_WEAK_PX = 0.2
+_WEAK_PX = 0.2  # short runs of rows known no better are given up
 # So are shorter runs than these, with a laser-off frame and without: what one block of rows shows alone may be print.
 _FEWEST_ROWS = (4, BLOCK + 2)
 # A core inside a blob that was fitted is at most this share of the blob's width; half the window it is looked for in.
@@ -91,6 +89,7 @@ def look(
     still: NDArray[np.bool_] | None = None,
     laser: Laser | None = None,
     rounding: Rounding | None = None,
+    matched: bool = False,
 ) -> Look:
     """Locate the laser line as `find_laser_line` does, and all else that looks like one.
 
@@ -100,16 +99,17 @@ def look(
         laser: what another picture of the scan has told of it (see `laser_of`), where `params` leave its channel open;
             a picture in which most rows have no line in that channel is asked for its own.
         rounding: of the file that the picture was, as `rounding_of` reads it.
+        matched: whether `background` lies on the picture as it is, at its exposure.
     """
-    if background is not None:
+    if background is not None and not matched:
         background = in_place(image, background)
+    seen = partial(_look, image[None], params, background, window, still, roundings=[rounding], matched=matched)
     if laser is not None and params.grey == "auto" and image.ndim == 3:
-        told = _look(image[None], params, background, window, still, laser, [rounding])[0]
+        told = seen(laser=laser)[0]
         if _mostly_found(told) or (own := channel_of(image, background, params.grey)) == laser.channel:
             return told
-        return _look(image[None], params, background, window, still, own, [rounding])[0]
-    channel = channel_of(image, background, params.grey)
-    return _look(image[None], params, background, window, still, channel, [rounding])[0]
+        return seen(laser=own)[0]
+    return seen(laser=channel_of(image, background, params.grey))[0]
 
 
 def look_at_all(
@@ -155,6 +155,7 @@ def _look(
     still: NDArray[np.bool_] | None,
     laser: Laser | int | None,
     roundings: Sequence[Rounding | None],
+    matched: bool = False,
 ) -> list[Look]:
     """Look at pictures (P, H, W, ...) whose line is looked for in one channel, which may be all that is known of it."""
     channel, noises = laser if isinstance(laser, Laser) else (laser, None)
@@ -175,7 +176,7 @@ def _look(
     background = None if background is None else background[:, left : left + image.shape[1]]
     still = None if still is None else still[:, left : left + image.shape[1]]
     how = Conversion(params.grey, params.bit_index, params.off_threshold)
-    sight = sight_of(image, background, how, height, channel, roundings, noises)
+    sight = sight_of(image, background, how, height, channel, roundings, noises, matched)
     course = search(sight, window - left, params.min_snr, still)
     lines, lean = _found(sight, course, params, windows - left, still)
     lines.column_px[:] += left

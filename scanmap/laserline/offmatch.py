@@ -19,6 +19,8 @@ _BEYOND = 20  # [grey levels] a difference that counts no more for being larger:
 _MANY = 0.01  # share of such from which on something may have moved
 _BRIGHTEST = 245  # [grey levels] brighter ones may be cut
 _GROUPS, _TELLING = 8, 40  # of samples by brightness, and how many a group must have
+_SLIDE_STEPS = 3
+_LEAST_STRIPS = 2000  # samples of strips that tell how far they must be moved
 _LARGE = 1_000_000  # samples of a plane from which on fewer of them tell
 _DARKEST = 8  # [grey levels]
 _OUTLYING = 3.0  # [scatter] from where on samples may be the line's
@@ -100,6 +102,51 @@ def _step(on: U8, gain: float, off: list[U8]) -> tuple[NDArray[np.float64], NDAr
     shown = 1.0 - 0.25 * noise.size * variance / np.diag(normal)
     certain = np.where(shown > _SHOWN, shown / np.diag(np.linalg.inv(normal)), 1e-9)
     return step, np.sqrt(variance / certain)
+
+
+def slide_between(on: F32, off: F32, farthest: int) -> tuple[float, float]:
+    """How far right [px] strips `off` (N, n) of laser-off rows must be moved to lie on `on` (N, n), and its sigma.
+
+    Whole shifts first, then steps of Gauss and Newton, as in `shift_between`. NaN is what says nothing.
+
+    Args:
+        farthest: that is looked for [px].
+    """
+    usable = (off > _DARKEST) & (np.maximum(on, off) < _BRIGHTEST)
+    if np.count_nonzero(usable) < _LEAST_STRIPS:
+        return 0.0, np.inf
+    off = off * np.float32(np.median(on[usable] / off[usable]))
+    width = on.shape[1]
+
+    def moved(right: int) -> F32:
+        return off[:, farthest - right : width - farthest - right]
+
+    on = on[:, farthest : width - farthest]
+    ways = range(2 - farthest, farthest - 1)
+    apart = [float(np.nanmean(np.minimum(np.abs(on - moved(right)), _BEYOND))) for right in ways]
+    at, sigma = float(ways[int(np.argmin(apart))]), np.inf
+    for _ in range(_SLIDE_STEPS):
+        first = int(np.floor(at))
+        share = np.float32(at - first)
+        there, left, right = (
+            (1 - share) * moved(first + more) + share * moved(first + more + 1) for more in (0, 1, -1)
+        )
+        slope, rest = np.float32(0.5) * (right - left), on - there
+        fits = np.isfinite(slope) & (np.abs(rest) < _BEYOND)
+        # The exposure is told together with the step: what moves changes by how much brighter one of both seems.
+        basis, rest = np.stack([-slope[fits], there[fits]]).astype(np.float64), rest[fits].astype(np.float64)
+        certain = np.linalg.inv(basis @ basis.T + np.eye(2))
+        step, brighter = certain @ (basis @ rest)
+        variance = float(np.square(rest - np.array([step, brighter]) @ basis).sum()) / max(rest.size - 2, 1)
+        # Slopes are noise in part, half of the moved picture's, and the step is by so much too short.
+        noise = 1.0 - 2.0 * float(share) * (1.0 - float(share))
+        shown = 1.0 - 0.5 * noise / (1.0 + noise) * rest.size * variance * float(certain[0, 0])
+        if shown < _SHOWN:
+            return 0.0, np.inf
+        at += min(max(float(step) / shown, -0.5), 0.5)
+        off *= np.float32(1.0 + brighter)
+        sigma = float(np.sqrt(variance * certain[0, 0])) / shown
+    return at, sigma
 
 
 def exposure_between(plane: U8, background: U8, level: U8) -> tuple[float, F32 | None]:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanmap.laserline.candidates import BLOCK, is_large, noises_of
-from scanmap.laserline.channel import judged_channel
+from scanmap.laserline.candidates import BLOCK, is_large, noise_of, noises_of
+from scanmap.laserline.channel import SATURATED, judged_channel
 from scanmap.laserline.colour import without_colour
 from scanmap.laserline.difference import without_background
 from scanmap.laserline.grey import CHANNEL, NEIGHBOUR, Grey, extract, to_grey
@@ -30,6 +30,7 @@ ONE_FOR_ALL = -1  # the channel of a colour picture without colour
 _INDEPENDENT, _NONE = 1.2, 0.3
 # Share of a channel (blue, green, red) in what it and its neighbour have of brightness (BT.601's weights).
 BRIGHTNESS = (0.16, 0.66, 0.34)
+_NOISE_ROWS = 150  # of a laser-off frame that says little in places, that tell noise
 _BAND_PX = 3  # columns in a group that is compared with the next
 # How far the mixture goes from there to the laser's own channel where the file does not say what was rounded, at the
 # least, and for each grey level of noise: more averages noise, less the errors that all rows of an upright line share.
@@ -105,6 +106,7 @@ def sight_of(
     channel: int | None,
     roundings: Sequence[Rounding | None],
     noises: Noises | None = None,
+    matched: bool = False,
 ) -> Sight:
     """Look at pictures.
 
@@ -115,6 +117,7 @@ def sight_of(
         channel: as `channel_of` has it.
         roundings: (P,) of the files that the pictures were.
         noises: in that channel, where another picture has told them.
+        matched: whether the laser-off frame has the pictures' exposure.
 
     Raises:
         CameraError: the pictures are too narrow for a line.
@@ -136,16 +139,16 @@ def sight_of(
     off, even, beside, on_beside, gain = None, None, None, None, 1.0
     if background is not None:
         dark = to_grey(background, how.grey, how.bit_index, channel)
-        lit, off, even, gain = without_background(on, dark, how.off_threshold)
+        lit, off, even, gain = without_background(on, dark, how.off_threshold, matched)
         plane = np.asarray(cv2.max(on, off), np.uint8)
     rows = np.ascontiguousarray(quick_rows(lit, height))
-    noise = _noises(lit, rows, height)
+    noise = _noises(lit, rows, height) if off is None else _noise_where_known(lit, off, rows)
     mixtures = [Mixture(-1 if channel is None else channel)] * len(noise)
     if background is not None and channel is not None:
         mixture = _mixture(image, channel, float(noise[0]), roundings[0], noises)
         if mixture.channel >= 0:
             on_beside, off_beside = (extract(picture, NEIGHBOUR[channel]) for picture in (image, background))
-            beside, mixtures = without_background(on_beside, off_beside).lit, [mixture]
+            beside, mixtures = without_background(on_beside, off_beside, matched=matched).lit, [mixture]
     told = noise, mixtures, roundings, gain, beside, on_beside
     return Sight(height, on, off, even, plane, lit, rows, None, None, -1, *told)
 
@@ -178,6 +181,16 @@ def _noises(plane: U8, rows: U8, height: int) -> F64:
     # What is in the cache already, where it is enough.
     some = rows if is_large(plane[:height]) else plane
     return noises_of(some.reshape(len(plane) // height, -1, plane.shape[1]))
+
+
+def _noise_where_known(lit: U8, off: U8, rows: U8) -> F64:
+    """Noise (1,) of a sample of a difference, where the laser-off frame tells."""
+    some = slice(1, None, max(1, len(off) // _NOISE_ROWS))
+    known = off[some] < SATURATED
+    if known.all():
+        return _noises(lit, rows, len(lit))
+    steps = cv2.absdiff(lit[some, 1:], lit[some, :-1])[known[:, 1:] & known[:, :-1]]
+    return np.array([noise_of(np.asarray(steps, np.uint8))])
 
 
 def _noise_of(plane: U8) -> float:

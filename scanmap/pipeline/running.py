@@ -17,7 +17,8 @@ from scanmap.pipeline.step import Pipeline, Sink
 from scanmap.shot import Shot, decode_image
 
 _AHEAD = 3  # groups of shots that are read before the first is begun, where more than one make a group
-T = TypeVar("T")  # what is made of a shot
+S = TypeVar("S")  # a shot, or what else a thread is handed
+T = TypeVar("T")  # what is made of it
 CHECKED_IMAGES = 3  # so many of another size than the calibration's, and nothing is processed
 
 
@@ -55,8 +56,8 @@ def checked(shots: Iterable[Shot], pipeline: Pipeline) -> Iterator[Shot]:
 
 
 def run(
-    shots: Iterable[Shot],
-    process: Callable[[Shot], T],
+    shots: Iterable[S],
+    process: Callable[[S], T],
     sinks: Iterable[Callable[[T], None]],
     stop: Callable[[], bool] = lambda: False,
     workers: int = 0,
@@ -77,8 +78,8 @@ def run(
 
 
 def run_groups(
-    shots: Iterable[Shot],
-    process: Callable[[list[Shot]], Iterable[T]],
+    shots: Iterable[S],
+    process: Callable[[list[S]], Iterable[T]],
     sinks: Iterable[Callable[[T], None]],
     stop: Callable[[], bool],
     workers: int,
@@ -91,7 +92,7 @@ def run_groups(
     workers = workers or os.cpu_count() or 1
     sinks = tuple(sinks)
     pending: deque[Future[Iterable[T]]] = deque()
-    ahead: deque[Shot] = deque()
+    ahead: deque[S] = deque()
     most_ahead = _AHEAD * together if together > 1 else 1
     done = 0
 

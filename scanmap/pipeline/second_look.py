@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanmap.laserline import BLOCK, Reason, ridge_of
-from scanmap.pipeline.clean_flanks import by_clean_flanks
-from scanmap.pipeline.cut_beams import put_back
-from scanmap.pipeline.narrow_lines import place_narrow_lines
 from scanmap.pipeline.neighbours import Neighbours, neighbours_of
+from scanmap.pipeline.placing import Lines, place_lines
 from scanmap.pipeline.reflectance import Usual, reflectance, shape_of
 from scanmap.pipeline.running import run
 from scanmap.pipeline.step import Pipeline, Step
 from scanmap.pipeline.still import SHARE, StillThings
-from scanmap.pipeline.widths import Widths
 from scanmap.scan import Scan
 from scanmap.scan.second_lines import Pictures
 from scanmap.shot import Shot
@@ -69,25 +66,17 @@ class SecondLook:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self._keys: list[tuple[float, float]] = []
-        self._reflectance: list[F32] = []
-        self._shape: list[F32] = []  # (2, H) height and width of the lines
-        self._lean: list[F32 | None] = []
-        self._has_off: list[bool] = []
+        self._lines = Lines([], [], [], [], [])
         self._places: list[F32 | None] = []  # of pictures without laser-off frames: what does not change is gone there
         self._listed_in: list[F32 | None] = []
         self._others: dict[int, list[F32]] = {}  # columns (H,) that showed another thing, by bearing; NaN elsewhere
 
     def __call__(self, step: Step) -> None:
         """A sink: note one step; they come in the order in which their profiles are added to the scan."""
-        self._keys.append((step.shot.time, step.shot.bearing))
-        self._reflectance.append(reflectance(step))
-        self._shape.append(shape_of(step))
+        self._lines.note(step)
         places = None if step.fault else step.places
         self._places.append(places if step.shot.background is None else None)
         self._listed_in.append(places)
-        self._lean.append(step.lean)
-        self._has_off.append(step.shot.background is not None)
 
     def settle(self, scan: Scan, shots: Shots | None, without: Collection[int] = frozenset()) -> int:
         """Replace in `scan`, in place, what was not the line; returns how many points were another's or given up.
@@ -101,7 +90,7 @@ class SecondLook:
         """
         asked = [k for k in range(len(scan)) if k not in without]
         views = _apart(scan.bearings, [k for k in asked if self._places[k] is not None])
-        usual = Usual.of(self._reflectance, self._shape)
+        usual = Usual.of(self._lines.reflectance, self._lines.shape)
         known, total = _Known(self._listed(scan, views), False, None, usual), 0
         for _ in range(_TURNS):
             # Most scans of plain rooms need not be read again, nor asked more.
@@ -119,20 +108,7 @@ class SecondLook:
             known = known._replace(neighbours=neighbours_of(scan.bearings, scan.range_m, asked))
         if known.shown and total >= _HARD * scan.valid.sum():
             self._choose(scan, views, known._replace(choosing=True), shots)
-        widths = [shape[1] for shape in self._shape]
-        put = put_back(scan, self._pipeline, self._reflectance, widths, asked)
-        whole = np.zeros_like(put)
-        if asked:
-            whole[asked] = [np.isfinite(self._reflectance[k]) for k in asked]
-        # The thesis's ways to find the line stay as they are.
-        gauss = self._pipeline.laserline.method == "gauss"
-        usual_px = Widths.of(scan, self._pipeline.calibration, self._shape, whole) if gauss else None
-        if usual_px is not None:
-            left = whole & ~put
-            if shots is not None:
-                left &= ~by_clean_flanks(scan, self._pipeline, usual_px, widths, self._lean, left, shots, self._keys)
-            pure = [lean if off else None for lean, off in zip(self._lean, self._has_off, strict=True)]
-            place_narrow_lines(scan, self._pipeline, usual_px, widths, pure, left & scan.valid)
+        place_lines(scan, self._pipeline, self._lines, asked, shots)
         return total
 
     def _suspected(self, scan: Scan, views: list[int], known: _Known) -> bool:
@@ -151,10 +127,10 @@ class SecondLook:
         """The cells (B, H) that show another thing than the line."""
         wrong = np.zeros((len(scan), scan.rows), bool)
         for k in asked:
-            seen = self._reflectance[k], self._shape[k]
+            seen = self._lines.reflectance[k], self._lines.shape[k]
             wrong[k] = known.usual.nothing(*seen)
-            black = known.usual.hardly(self._reflectance[k]) | known.usual.polish(*seen)
-            thrown = known.usual.thrown(self._shape[k], scan.range_m[k])
+            black = known.usual.hardly(self._lines.reflectance[k]) | known.usual.polish(*seen)
+            thrown = known.usual.thrown(self._lines.shape[k], scan.range_m[k])
             if known.neighbours is not None and (black | thrown).any():
                 alone, beside_nothing = known.neighbours.alone(k, scan.range_m[k])
                 wrong[k] |= (black & alone) | (thrown & beside_nothing)
@@ -174,7 +150,7 @@ class SecondLook:
         for k, values in enumerate(lists):
             places[k, :, : values.shape[1]] = np.where(np.isfinite(values), values, np.inf)
         middles = (2.0 * np.arange(len(lists[0]), dtype=np.float64) + 0.5) * BLOCK - 0.5  # of every other block
-        bearings = np.array([self._keys[k][1] for k in some])
+        bearings = np.array([self._lines.keys[k][1] for k in some])
         window, project = self._pipeline.window, own.intrinsics.project
         T_axis_head = own.mount.T_axis_head()
         plane = own.laser_plane @ np.linalg.inv(T_axis_head)
@@ -187,7 +163,7 @@ class SecondLook:
             column = np.where(share < SHARE, column, np.nan)
             if np.isfinite(column).sum() < _LEAST_ROWS:
                 return np.zeros(scan.rows, bool)
-        return known.still.line(float(scan.bearings[k]), column, ridge_of(*self._shape[k]), part * share)
+        return known.still.line(float(scan.bearings[k]), column, ridge_of(*self._lines.shape[k]), part * share)
 
     def _choose(self, scan: Scan, views: list[int], known: _Known, shots: Shots | None) -> None:
         """Look again where the line is listed on the neighbours' course and something else was taken, or nothing."""
@@ -207,7 +183,7 @@ class SecondLook:
 
     def _shown(self, views: list[int], shots: Iterable[Shot]) -> StillThings:
         """What the pictures of some bearings show, read once more."""
-        still, wanted = StillThings(self._pipeline.calibration), {self._keys[k] for k in views}
+        still, wanted = StillThings(self._pipeline.calibration), {self._lines.keys[k] for k in views}
         with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="decode") as pool:
             some = (shot for shot in shots if (shot.time, shot.bearing) in wanted)
             for bearing, ridges in pool.map(lambda shot: (shot.bearing, self._pipeline.ridges(shot)), some):
@@ -234,7 +210,7 @@ class SecondLook:
             return
         places: dict[tuple[float, float], list[int]] = {}
         for k in map(int, np.flatnonzero(again)):
-            places.setdefault(self._keys[k], []).append(k)
+            places.setdefault(self._lines.keys[k], []).append(k)
             self._others.setdefault(k, []).append(np.where(wrong[k], scan.column_px[k], np.nan))
         scan.give_up(wrong, Reason.AMBIGUOUS)
 
@@ -263,8 +239,8 @@ class SecondLook:
             for k in places[step.shot.time, step.shot.bearing]:
                 new = ~scan.valid[k] & (step.profile.reason == Reason.OK)
                 scan.amend(k, new, step.profile)
-                self._reflectance[k][new] = reflectance(step)[new]
-                self._shape[k][:, new] = shape_of(step)[:, new]
+                self._lines.reflectance[k][new] = reflectance(step)[new]
+                self._lines.shape[k][:, new] = shape_of(step)[:, new]
 
         run(wanted(), look, [take])
 

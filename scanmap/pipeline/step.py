@@ -155,6 +155,33 @@ class Pipeline:
         own = self.laser if self.laserline.grey == "auto" else None
         return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image))
 
+    def picture(self, shot: Shot) -> Image | None:
+        """A shot's picture as the line is found in it; None where it cannot be read whole."""
+        try:
+            image, whole = self._decode(shot.image, self._grey(shot.image))
+        except CameraError:
+            return None
+        return image if whole == len(image) else None
+
+    def channel_of(self, image: Image) -> int:
+        """The channel of a picture in which the line shows; green, where that is open."""
+        if image.ndim == 2 or self.laser is None or self.laser.channel < 0:
+            return 1
+        return self.laser.channel
+
+    def look_without(self, shot: Shot, image: Image, dark: Image) -> Step:
+        """What `process` gives with a laser-off frame that matches the shot's picture."""
+        seen = self.laserline, dark, self.window, None, self.laser, rounding_of(shot.image), True
+        found = look(image, *seen)
+        profile = triangulate(found.line, self.calibration, self.triangulation)
+        return Step(shot, found.line, profile, "", found.places, found.lean)
+
+    def clean_flanks_without(self, shot: Shot, image: Image, dark: Image, line: F64, usual: Usual) -> Moved:
+        """What `by_clean_flanks` gives with a laser-off frame that matches the shot's picture."""
+        own = self.laser if self.laserline.grey == "auto" else None
+        asked = np.isfinite(line)
+        return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image), True)
+
     def _grey(self, data: bytes) -> bool:
         """Whether a picture's brightness is all that is asked for, or all there is of its channels."""
         return not self.colour or (self.laserline.grey in _CHANNELS and is_grey(data))
