@@ -2,9 +2,9 @@
 
     python benchmarks/flanks.py [--seeds 6]
 
-The pictures are those of tests/test_clean_flanks.py, tests/test_cut_beams.py and tests/test_joints.py; the picture of
-them goes to docs/img/flanks.png: rows from above magnified, what a Gaussian fitted to both halves says in red, the
-clean flank in green, the truth in white.
+The pictures are those of tests/test_clean_flanks.py, test_cut_beams.py, test_joints.py and test_room_light.py; the
+picture of them goes to docs/img/flanks.png: rows from above magnified, what a Gaussian fitted to both halves says in
+red, the clean flank in green, the truth in white.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import test_clean_flanks as lines
 import test_cut_beams as beams
 import test_joints as joints
+import test_room_light as walls
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -96,12 +97,26 @@ def on_joints() -> None:
             print(f"{lens_px:7.1f} {albedo:7.1f} {before:7.3f} {after:7.3f} {sigma:7.3f} {shadow:9.3f}")
 
 
+def on_walls() -> None:
+    """Print a table of lines on joints of a tiled wall, swept without laser-off frames; rms over places, in pixels."""
+    print(f"\n{'bearings deg':>12s} {'off px':>7s} {'after':>7s}   other bearings")
+    for off_deg in (0.0, 0.05, 0.1, 0.2):
+        each = []
+        for joint_m in (-0.006, -0.005, -0.0035, -0.002, 0.002, 0.0035, 0.005, 0.006):
+            shots = walls.shots(joint_m, off_deg)
+            (before, _), (after, _) = (walls.swept(shots, settled) for settled in (False, True))
+            others = [np.median(walls.off_middle(after, k)) for k in range(len(shots)) if k != walls.ON_JOINT]
+            each.append([*(np.median(walls.off_middle(scan)) for scan in (before, after)), np.max(np.abs(others))])
+        print(f"{off_deg:12.2f} {'{:7.3f} {:7.3f} {:7.3f}'.format(*np.sqrt(np.mean(np.square(each), axis=0)))}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=6)
     pictures = flanks(parser.parse_args().seeds)
     posts()
     on_joints()
+    on_walls()
     folder = Path(__file__).parent.parent / "docs" / "img"
     cv2.imwrite(str(folder / "flanks.png"), np.hstack(pictures))
 

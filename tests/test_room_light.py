@@ -105,7 +105,7 @@ def grey(data: bytes) -> U8:
 
 
 @pytest.mark.parametrize("off_deg", [0.0, 0.1])
-@pytest.mark.parametrize("joint_m", [-0.005, -0.0035, 0.0035, 0.005])
+@pytest.mark.parametrize("joint_m", [-0.006, -0.005, -0.0035, 0.0035, 0.005, 0.006])
 def test_a_line_on_a_joint_is_where_the_middle_of_the_sheet_is(joint_m: float, off_deg: float) -> None:
     """Bearings that are wrong by 0.1 deg lie a pixel beside each other's pictures, and more."""
     some = shots(joint_m, off_deg)
@@ -156,12 +156,26 @@ def test_a_bearing_that_was_withdrawn_says_nothing_of_others() -> None:
     assert unlit_lines._others(np.radians([0.0, 20.0, 40.0]), np.ones(3, bool), 1, 554.0) == []
 
 
+class Usual:
+    """Widths of 2000 bearings, as far from what is usual as it is told."""
+
+    def __init__(self, ratio: float) -> None:
+        self.ratio = ratio
+
+    def ratios(self) -> tuple[F64, NDArray[np.bool_]]:
+        return np.full((2000, 20), self.ratio), np.ones((2000, 20), bool)
+
+
 def test_of_a_long_scan_only_the_lines_that_lean_most_are_asked() -> None:
-    lean = [np.full(20, 0.03 + 1e-4 * k, np.float32) for k in range(2000)]
-    asked = unlit_lines._leaning(lean, np.ones(2000, bool))
-    assert asked == list(range(1750, 2000))
+    lean, speaks = [np.full(20, 0.03 + 1e-4 * k, np.float32) for k in range(2000)], np.ones(2000, bool)
+    assert unlit_lines._doubtful(Usual(0.0), lean, speaks) == list(range(1750, 2000))
     lean[1800] = np.full(20, 0.01, np.float32)
-    assert 1800 not in unlit_lines._leaning(lean, np.ones(2000, bool))
+    assert 1800 not in unlit_lines._doubtful(Usual(0.0), lean, speaks)
+    straight = [np.zeros(20, np.float32)] * 2000
+    assert unlit_lines._doubtful(Usual(0.05), straight, speaks) == []
+    assert len(unlit_lines._doubtful(Usual(-0.1), straight, speaks)) == 250
+    speaks[:1990] = False
+    assert unlit_lines._doubtful(Usual(-0.1), straight, speaks) == list(range(1990, 2000))
 
 
 class Watched(Shot):

@@ -1,9 +1,9 @@
 """Lines that the room's own light may have moved, looked at again with that light taken away.
 
 Joints of tiles, paint and shadows under the line move it, and where no laser-off frame was taken its picture alone does
-not tell by how much. Other bearings' pictures do (`room_light`): a line that leans over many rows is found once more
-against what they show, as with a laser-off frame. It is replaced where it is moved by more than noise explains, or is
-better known.
+not tell by how much. Other bearings' pictures do (`room_light`): a line that leans over many rows, or is not as wide as
+usual, is found once more against what they show, as with a laser-off frame. It is replaced where it is moved by more
+than noise explains, or is better known.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Key = tuple[float, float]  # time and bearing of a shot
 
-# How much a line leans, in means of some blocks of rows, from which on it is asked, and how many such there are. In 33
-# drawn sweeps that is every other bearing, and 98 % of what all of them would gain.
-_LEANS, _BLOCKS, _MANY = 0.02, 3, 6
+# How much a line leans, or how far the logarithm of its width is from the usual one's, in means of some blocks of rows,
+# from which on it is asked, and how many such there are. In 33 drawn sweeps that is 45 % of the bearings, with 99 % of
+# what all of them would gain.
+_LEANS, _UNUSUAL, _BLOCKS, _MANY = 0.03, 0.07, 3, 6
 _MOST, _LEAST = 1.0 / 8.0, 100  # share of all bearings that are asked at most, or so many: each costs as ten others
 # How far the line must have moved on in another bearing's picture, and how far the head may have turned to it.
 _MOVED_ON_PX, _FARTHEST = 60.0, float(np.radians(12.0))
@@ -91,7 +92,7 @@ def look_without_light(
     """
     replaced = Replaced(*np.zeros((2, len(scan), scan.rows), bool))
     speaks, focal_px = np.asarray(asked.any(axis=1)), pipeline.calibration.intrinsics.fx
-    others = {k: _others(scan.bearings, speaks, k, focal_px) for k in _leaning(lean, speaks)}
+    others = {k: _others(scan.bearings, speaks, k, focal_px) for k in _doubtful(usual, lean, speaks)}
     others = {k: some for k, some in others.items() if some}
     if not others:
         return replaced
@@ -134,22 +135,29 @@ def look_without_light(
     return replaced
 
 
-def _leaning(lean: Sequence[F32 | None], speaks: Mask) -> list[int]:
-    """Bearings whose line leans over many rows; where these are too many, those that lean most."""
-    much = {}
-    for k, own in enumerate(lean):
-        if own is None or not speaks[k]:
-            continue
-        known = np.isfinite(own)
-        total, count = (
-            cv2.blur(values.astype(np.float32)[None], (_BLOCKS, 1), borderType=cv2.BORDER_CONSTANT)[0]
-            for values in (np.where(known, own, 0.0), known)
-        )
-        leans = np.abs(total) / np.maximum(count, np.float32(1.0 / _BLOCKS))
-        if np.count_nonzero(leans > _LEANS) >= _MANY:
-            much[k] = float(leans[leans > _LEANS].sum())
+def _doubtful(usual: Widths, lean: Sequence[F32 | None], speaks: Mask) -> list[int]:
+    """Bearings whose line leans over many rows, or is not as wide as usual; of too many those that most do."""
+    ratio, slant_known = usual.ratios()
+    unknown = np.full(ratio.shape[1], np.nan, np.float32)
+    leans = _along(np.stack([unknown if own is None else own for own in lean])) / _LEANS
+    unusual = _along(np.where(slant_known, ratio, np.nan)) / _UNUSUAL
+    much = {
+        k: float(np.maximum(leans[k], unusual[k]).sum())
+        for k in np.flatnonzero(speaks).tolist()
+        if max(np.count_nonzero(own[k] > 1.0) for own in (leans, unusual)) >= _MANY
+    }
     most = max(_LEAST, int(_MOST * len(lean)))
     return sorted(sorted(much, key=lambda k: -much[k])[:most])
+
+
+def _along(values: F32 | F64) -> F32:
+    """Sizes (B, n) of means of what is known of values (B, n) along lines; zero where nothing is."""
+    known = np.isfinite(values)
+    total, count = (
+        np.asarray(cv2.blur(own.astype(np.float32), (_BLOCKS, 1), borderType=cv2.BORDER_CONSTANT), np.float32)
+        for own in (np.where(known, values, 0.0), known)
+    )
+    return np.asarray(np.abs(total) / np.maximum(count, np.float32(1.0 / _BLOCKS)), np.float32)
 
 
 def _others(bearings: F64, speaks: Mask, k: int, focal_px: float) -> list[int]:
