@@ -168,12 +168,12 @@ class Usual:
 
 def test_of_a_long_scan_only_the_lines_that_lean_most_are_asked() -> None:
     lean, speaks = [np.full(20, 0.03 + 1e-4 * k, np.float32) for k in range(2000)], np.ones(2000, bool)
-    assert unlit_lines._doubtful(Usual(0.0), lean, speaks) == list(range(1750, 2000))
-    lean[1800] = np.full(20, 0.01, np.float32)
-    assert 1800 not in unlit_lines._doubtful(Usual(0.0), lean, speaks)
+    assert unlit_lines._doubtful(Usual(0.0), lean, speaks) == list(range(1900, 2000))
+    lean[1950] = np.full(20, 0.01, np.float32)
+    assert 1950 not in unlit_lines._doubtful(Usual(0.0), lean, speaks)
     straight = [np.zeros(20, np.float32)] * 2000
     assert unlit_lines._doubtful(Usual(0.05), straight, speaks) == []
-    assert len(unlit_lines._doubtful(Usual(-0.1), straight, speaks)) == 250
+    assert len(unlit_lines._doubtful(Usual(-0.1), straight, speaks)) == 100
     speaks[:1990] = False
     assert unlit_lines._doubtful(Usual(-0.1), straight, speaks) == list(range(1990, 2000))
 

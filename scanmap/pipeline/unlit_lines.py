@@ -34,7 +34,7 @@ Key = tuple[float, float]  # time and bearing of a shot
 # from which on it is asked, and how many such there are. In 33 drawn sweeps that is 45 % of the bearings, with 99 % of
 # what all of them would gain.
 _LEANS, _UNUSUAL, _BLOCKS, _MANY = 0.03, 0.07, 3, 6
-_MOST, _LEAST = 1.0 / 8.0, 100  # share of all bearings that are asked at most, or so many: each costs as ten others
+_MOST = 100  # bearings that are asked, each of which costs as ten others do
 # How far the line must have moved on in another bearing's picture, and how far the head may have turned to it.
 _MOVED_ON_PX, _FARTHEST = 60.0, float(np.radians(12.0))
 _FEWEST = 25  # rows in which the room's light is known
@@ -146,8 +146,7 @@ def _doubtful(usual: Widths, lean: Sequence[F32 | None], speaks: Mask) -> list[i
         for k in np.flatnonzero(speaks).tolist()
         if max(np.count_nonzero(own[k] > 1.0) for own in (leans, unusual)) >= _MANY
     }
-    most = max(_LEAST, int(_MOST * len(lean)))
-    return sorted(sorted(much, key=lambda k: -much[k])[:most])
+    return sorted(sorted(much, key=lambda k: -much[k])[:_MOST])
 
 
 def _along(values: F32 | F64) -> F32:
