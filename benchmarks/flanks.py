@@ -104,7 +104,7 @@ def on_walls() -> None:
         each = []
         for joint_m in (-0.006, -0.005, -0.0035, -0.002, 0.002, 0.0035, 0.005, 0.006):
             shots = walls.shots(joint_m, off_deg)
-            (before, _), (after, _) = (walls.swept(shots, settled) for settled in (False, True))
+            before, after = (walls.swept(shots, settled) for settled in (False, True))
             others = [np.median(walls.off_middle(after, k)) for k in range(len(shots)) if k != walls.ON_JOINT]
             each.append([*(np.median(walls.off_middle(scan)) for scan in (before, after)), np.max(np.abs(others))])
         print(f"{off_deg:12.2f} {'{:7.3f} {:7.3f} {:7.3f}'.format(*np.sqrt(np.mean(np.square(each), axis=0)))}")

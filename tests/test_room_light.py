@@ -70,7 +70,9 @@ def picture(bearing: float, joint_m: float | None, lit: bool, seed: int) -> byte
     seen = cv2.GaussianBlur(light, (0, 0), LENS_PX * FINER, sigmaY=1e-3).reshape(HEIGHT, WIDTH, FINER).mean(axis=2)
     levels = 255.0 * np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
     levels += rng.normal(0.0, NOISE, levels.shape)
-    return bytes(cv2.imencode(".jpg", np.clip(np.rint(levels), 0, 255), [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
+    return bytes(
+        cv2.imencode(".jpg", np.clip(np.rint(levels), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    )
 
 
 @lru_cache
@@ -84,17 +86,17 @@ def shots(joint_m: float | None, off_deg: float = 0.0) -> list[Shot]:
     ]
 
 
-def swept(some: list[Shot], settled: bool = True) -> tuple[Scan, Pipeline]:
+def swept(some: list[Shot], settled: bool = True) -> Scan:
     pipeline = Pipeline(HEAD, LaserLineParams(grey="luminance_601", pool_rows=9), TriangulationParams())
     scan, second = Scan(HEAD.mount, HEIGHT), SecondLook(pipeline)
     run(some, pipeline.process, [lambda step: scan.add(step.profile, step.shot.bearing), second], workers=1)
     if settled:
         second.settle(scan, lambda: some)
-    return scan, pipeline
+    return scan
 
 
 def off_middle(scan: Scan, k: int = ON_JOINT) -> F64:
-    """How far the line is found off the sheet's middle [px], in rows that no horizontal joint crosses."""
+    """How far the line is found off the sheet's middle [px], in rows that have one."""
     off = scan.column_px[k] - middle(float(BEARINGS[k]))[1]
     assert np.isfinite(off).mean() > 0.9
     return off[np.isfinite(off)]
@@ -109,7 +111,7 @@ def grey(data: bytes) -> U8:
 def test_a_line_on_a_joint_is_where_the_middle_of_the_sheet_is(joint_m: float, off_deg: float) -> None:
     """Bearings that are wrong by 0.1 deg lie a pixel beside each other's pictures, and more."""
     some = shots(joint_m, off_deg)
-    before, (scan, _) = off_middle(swept(some, settled=False)[0]), swept(some)
+    before, scan = off_middle(swept(some, settled=False)), swept(some)
     after, sigma = off_middle(scan), scan.sigma_m[ON_JOINT] / np.nanmedian(scan.range_m[ON_JOINT])
     assert abs(np.median(before)) > 0.15
     assert abs(np.median(after)) < 0.4 * abs(np.median(before))
@@ -121,7 +123,7 @@ def test_a_line_on_a_joint_is_where_the_middle_of_the_sheet_is(joint_m: float, o
 
 def test_the_picture_without_the_laser_is_the_room() -> None:
     some = shots(0.0035)
-    scan, _ = swept(some, settled=False)
+    scan = swept(some, settled=False)
     others = [(k, grey(some[k].image)) for k in (ON_JOINT - 1, ON_JOINT + 1)]
     dark = unlit(scan, HEAD, ON_JOINT, grey(some[ON_JOINT].image), others, 0)
     true = grey(picture(float(BEARINGS[ON_JOINT]), 0.0035, False, 99)).astype(float)
@@ -134,7 +136,7 @@ def test_the_picture_without_the_laser_is_the_room() -> None:
 
 def test_of_a_thing_that_stood_beside_the_line_only_later_nothing_is_taken() -> None:
     some = shots(0.0035)
-    scan, _ = swept(some, settled=False)
+    scan = swept(some, settled=False)
     later = grey(some[ON_JOINT + 1].image).copy()
     later[:96] //= 2
     dark = unlit(scan, HEAD, ON_JOINT, grey(some[ON_JOINT].image), [(ON_JOINT + 1, later)], 0)
@@ -143,7 +145,7 @@ def test_of_a_thing_that_stood_beside_the_line_only_later_nothing_is_taken() -> 
 
 def test_a_plain_wall_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unlit_lines, "unlit", None)
-    scan, _ = swept(shots(None))
+    scan = swept(shots(None))
     assert abs(np.median(off_middle(scan))) < 0.03
 
 

@@ -151,9 +151,7 @@ class Pipeline:
             image = self._decode(shot.image, self._grey(shot.image)).image
         except CameraError:
             return None
-        dark, _ = self._background(shot)
-        own = self.laser if self.laserline.grey == "auto" else None
-        return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image))
+        return self._clean_flanks(shot, image, self._background(shot)[0], line, usual, asked)
 
     def picture(self, shot: Shot) -> Image | None:
         """A shot's picture as the line is found in it; None where it cannot be read whole."""
@@ -178,9 +176,20 @@ class Pipeline:
 
     def clean_flanks_without(self, shot: Shot, image: Image, dark: Image, line: F64, usual: Usual) -> Moved:
         """What `by_clean_flanks` gives with a laser-off frame that matches the shot's picture."""
+        return self._clean_flanks(shot, image, dark, line, usual, np.isfinite(line), matched=True)
+
+    def _clean_flanks(
+        self,
+        shot: Shot,
+        image: Image,
+        dark: Image | None,
+        line: F64,
+        usual: Usual,
+        asked: NDArray[np.bool_],
+        matched: bool = False,
+    ) -> Moved:
         own = self.laser if self.laserline.grey == "auto" else None
-        asked = np.isfinite(line)
-        return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image), True)
+        return by_clean_flanks(image, self.laserline, line, usual, asked, dark, own, rounding_of(shot.image), matched)
 
     def _grey(self, data: bytes) -> bool:
         """Whether a picture's brightness is all that is asked for, or all there is of its channels."""

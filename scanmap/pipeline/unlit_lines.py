@@ -119,20 +119,27 @@ def look_without_light(
     run(_jobs(others, shots(), keys), look, [looks.append])
     found = [one for one in looks if one is not None]
     beside_px = _usually([slid for one in found for slid in one.slid_px])
-    for k, step, told, sigma_px, _, moved in found:
-        by = step.profile.column_px - scan.column_px[k].astype(np.float64)
-        slid = np.where(np.isfinite(sigma_px), sigma_px, beside_px)
-        with np.errstate(invalid="ignore"):
-            alone = scan.valid[k] & (step.profile.reason == Reason.OK) & (np.abs(by) < _SAME_PX)
-            alone &= asked[k] & told & (slid < _TOO_FAR_PX) & (step.profile.intensity > _LOWER * scan.intensity[k])
-            surer = step.profile.sigma_m < _SURER * scan.sigma_m[k]
-        rows = alone & (_moved(by, alone) | surer)
+    for one in found:
+        k, moved = one.k, one.moved
+        rows, alone, doubt = _told(scan, asked[k], one, beside_px)
         replaced.all[k], replaced.by_flank[k] = rows, rows & (moved.by != 0.0)
-        scan.amend(k, rows, step.profile)
-        take(k, rows, alone, step)
-        doubt = np.hypot(moved.doubt[rows], slid[rows] * np.abs(by[rows]) / _WAY_PX)
-        move(scan, pipeline, k, np.flatnonzero(rows), moved.by[rows], doubt)
+        scan.amend(k, rows, one.step.profile)
+        take(k, rows, alone, one.step)
+        move(scan, pipeline, k, np.flatnonzero(rows), moved.by[rows], np.hypot(moved.doubt, doubt)[rows])
     return replaced
+
+
+def _told(scan: Scan, asked: Mask, found: _Found, beside_px: float) -> tuple[Mask, Mask, F64]:
+    """Of a bearing's rows (H,) those that are replaced and those found without the room's light; and a doubt [px]."""
+    k, profile = found.k, found.step.profile
+    by = profile.column_px - scan.column_px[k].astype(np.float64)
+    slid = np.where(np.isfinite(found.sigma_px), found.sigma_px, beside_px)
+    with np.errstate(invalid="ignore"):
+        alone = scan.valid[k] & (profile.reason == Reason.OK) & (np.abs(by) < _SAME_PX)
+        alone &= asked & found.told & (slid < _TOO_FAR_PX) & (profile.intensity > _LOWER * scan.intensity[k])
+        surer = profile.sigma_m < _SURER * scan.sigma_m[k]
+    doubt = np.where(alone, slid, 0.0) * np.where(alone, np.abs(by), 0.0) / _WAY_PX
+    return alone & (_moved(by, alone) | surer), alone, doubt
 
 
 def _doubtful(usual: Widths, lean: Sequence[F32 | None], speaks: Mask) -> list[int]:
